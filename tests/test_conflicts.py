@@ -6,8 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
 
-from sbt.metrics.conflict_types import conflict, conflict_type, describe_conflict_type
+from sbt.metrics.conflict_types import conflict, conflict_type, describe_conflict_type, from_behind
+from sbt.metrics.geometry import contact_index
 from sbt.metrics.pairwise import in_traffic
 from sbt.metrics.planar import TTC_2D_MIN
 from sbt.metrics.preventability import applicability, why_not
@@ -15,7 +18,7 @@ from sbt.metrics.stl import stl
 from sbt.metrics.traffic import ttc_path_min
 from sbt.problem.metric import Metric
 from sbt.problem.requirement import CriticalInterval
-from sbt.problem.trace import Trace
+from sbt.problem.trace import ActorTrace, Trace
 
 CRITICAL = CriticalInterval(high=1.5)
 
@@ -97,3 +100,98 @@ def test_a_metric_that_needs_more_than_one_instant_is_decided_when_it_has_its_va
     trace = overtaken()
     own = Metric("own", lambda trace: float(np.diff(trace.actor("stopped").x - trace.actor("ego").x).min()) and 1.0)
     assert conflict(trace, "ego", [(own, CRITICAL)])[0] == "stopped"
+
+
+def met(ego, other, *, speeds=(0.0, 0.0), sizes=((5.0, 1.8), (5.0, 1.8)), step=0.5) -> Trace:
+    """Return a run of two, each given as (x, y, heading) at every instant."""
+    poses = np.stack([np.array(ego, dtype=float), np.array(other, dtype=float)], axis=1)  # (t, 2, 3)
+    x, y, heading = np.moveaxis(poses, 2, 0).copy()
+    v, (length, width) = np.zeros_like(x) + speeds, np.array(sizes).T
+    return Trace(step * np.arange(len(x)), ("ego", "co"), x, y, heading, v, np.zeros_like(x), length, width)
+
+
+def told(trace: Trace) -> str:
+    return describe_conflict_type(conflict_type()(trace))
+
+
+@pytest.mark.parametrize("closing", [1.0, 3.2, 4.0, 9.0, 14.0])
+@pytest.mark.parametrize("turn", [0.0, 1.0, 3.0])
+def test_who_is_straight_ahead_or_behind_is_not_beside_however_far_a_step_drives_them_into_each_other(closing, turn):
+    """After a step of the default (Euler) they overlap by more than their width: one failure was two modes."""
+    cos, sin = np.cos(turn), np.sin(turn)
+
+    def along(*at, back=False):
+        return [(cos * d, sin * d, turn + np.pi * back) for d in at]
+
+    gap = 5.25
+    ahead = met(along(0.0, closing), along(gap, gap), speeds=(30.0, 10.0))
+    oncoming = met(along(0.0, closing), along(gap, gap - 2.0, back=True), speeds=(30.0, 10.0))
+    behind = met(along(gap, gap), along(0.0, closing), speeds=(10.0, 30.0))
+    assert [told(trace) for trace in (ahead, oncoming, behind)] == [
+        "ahead of ego, same direction", "ahead of ego, oncoming", "behind ego, same direction"
+    ]  # fmt: skip
+    assert [from_behind(t.actor("ego"), t.actor("co")) for t in (ahead, oncoming, behind)] == [False, False, True]
+    assert why_not(applicability()(ahead)) == ""
+    assert "from behind" in why_not(applicability()(behind))
+
+
+def test_who_comes_from_the_side_is_beside():
+    stays = [(0.0, 0.0, 0.0)] * 2
+    for y, side in ((3.5, "left"), (-3.5, "right")):
+        assert told(met(stays, [(0.5, y, 0.0), (0.5, 0.1 * y, 0.0)], speeds=(30.0, 30.0))) == f"{side} of ego, same direction"
+    crossing = met(stays, [(0.0, -6.0, np.pi / 2), (0.0, 1.0, np.pi / 2)], speeds=(10.0, 14.0))
+    assert told(crossing) == "right of ego, crossing from the right"
+
+
+def test_who_has_been_passed_through_when_a_contact_ends_the_record_was_ahead():
+    """A person who crosses is 15 m further within a step of a second: before the bumper at first, behind the car then."""
+    person = [(8.0, -0.5, np.pi / 2), (8.0, 0.9, np.pi / 2)]
+    trace = met([(0.0, 0.0, 0.0), (15.0, 0.0, 0.0)], person, speeds=(15.0, 1.4), sizes=((5.0, 1.8), (0.3, 0.5)), step=1.0)
+    assert told(trace) == "ahead of ego, crossing from the right"
+
+
+def test_a_part_that_a_step_drives_the_ego_into_deeply_is_told_by_what_it_reached_first():
+    straight = met([(0.0, 0.0, 0.0), (9.0, 0.0, 0.0)], [(13.0, 0.0, 0.0), (13.5, 0.0, 0.0)], sizes=((5.0, 1.8), (12.0, 1.8)))
+    co, still = straight.actor("co"), np.zeros(2)
+    parts = tuple(ActorTrace(co.x + at, still, still, still, still, 4.0, 1.8) for at in (4.0, 0.0, -4.0))
+    found = conflict(replace(straight, parts={"co": parts}), "ego")
+    assert found is not None
+    assert found[2] is not parts[0]
+    assert found[2].x[1] == parts[2].x[1], "the rear one"
+
+
+def test_who_is_first_seen_within_another_is_where_it_came_from_at_its_speed():
+    at, there = [(0.0, 0.0, 0.0)], [(2.0, 0.3, 0.0)]
+    assert told(met(at, there, speeds=(20.0, 10.0))) == "ahead of ego, same direction"
+    assert told(met(there, at, speeds=(10.0, 20.0))) == "behind ego, same direction"
+    assert told(met(at, [(-1.0, 0.3, -np.pi / 2)], speeds=(0.5, 10.0))) == "left of ego, crossing from the left"
+    assert told(met(at, [(1.0, 1.5, 0.0)], speeds=(10.0, 10.0))) == "left of ego, same direction", "by the lesser overlap"
+
+
+@given(
+    st.floats(-3.1, 3.1), st.floats(-3.1, 3.1), st.floats(3.0, 40.0), st.floats(-1.5, 1.5), st.floats(0.02, 0.98),
+    st.sampled_from([0.1, 0.5, 1.0]),
+)  # fmt: skip
+@settings(max_examples=200)
+def test_the_side_of_a_contact_does_not_depend_on_when_the_instants_are(heading, bearing, closing, aside, phase, step):
+    """The other comes on a straight line, with some offset: sampled finely, and at the instants of a step."""
+    to = np.array([-np.cos(bearing), -np.sin(bearing)])
+    offset = aside * np.array([to[1], -to[0]])
+
+    def sampled(times):
+        way = to[:, None] * closing * times + offset[:, None] * np.ones_like(times)
+        still = np.zeros_like(times)
+        poses = np.stack([still, still, still], axis=1), np.stack([*way, still + heading], axis=1)
+        return met(*poses, speeds=(0.2, closing), step=step)
+
+    begin = -10.0 / closing
+    fine = sampled(np.arange(begin, -begin, 0.002 / closing))
+    k = contact_index(fine.actor("ego"), fine.actor("co"))
+    assume(k is not None)
+    exact = fine.select(slice(k - 1, k + 1))
+    moves = [np.array([[0.0, d], [0.0, e]]) for d in (-0.02, 0.02) for e in (-0.02, 0.02)]
+    shifted = [told(replace(exact, x=exact.x + x, y=exact.y + y)) for x, y in moves]
+    assume(len({*shifted, told(exact)}) == 1)  # not at a corner
+    coarse = sampled((np.arange(-2, 1) + phase) * step + begin + k * 0.002 / closing)
+    last = contact_index(coarse.actor("ego"), coarse.actor("co"))
+    assert told(coarse.select(slice(0, (last or 2) + 1))) == told(exact)

@@ -13,7 +13,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from sbt.metrics.geometry import part_pairs, rectangle_distance
+from sbt.metrics.geometry import (
+    Rectangles,
+    first_touch,
+    overlap_depth,
+    part_pairs,
+    rectangle_at,
+    rectangle_distance,
+    touching_first,
+)
 from sbt.metrics.longitudinal import FAR
 from sbt.metrics.moments import first_at_its_worst
 from sbt.problem.arrays import Vector
@@ -47,7 +55,8 @@ Decisive = tuple[Metric, CriticalInterval]
 def conflict_type(ego: str = "ego", decisive: Sequence[Decisive] = ()) -> Metric:
     """Return the metric `conflict_type`: 4 side + course when it was decided; -1: nobody within 1 km.
 
-    Side: 0 ahead, 1 left, 2 behind, 3 right of the ego's rectangle, by the side that the other is farther away from.
+    Side: 0 ahead, 1 left, 2 behind, 3 right of the ego's rectangle, by the side that the other is farther away from; in a
+    contact, where the two begin to touch within the step.
     Course: heading of the other relative to the ego's; 0 the same, 1 turned left by 45 to 135 degrees (it comes from
     the right), 2 oncoming, 3 turned right. 16 more where ego stands, 32 more where one of `Trace.unreacting` comes from
     behind. Absent road users (NaN) do not count. If no actor has the name `ego`, the first actor is the ego.
@@ -103,7 +112,10 @@ def _nearest_of(
                 distance, at = _nearest(part, other, instant)
                 if distance < best:
                     best, met = distance, (name, part, other, at)
-    return met
+    if met is None or best > 0.0:
+        return met
+    name, *_, at = met
+    return (name, *touching_first(list(part_pairs(own, trace.actor(name))), at), at)
 
 
 def _nearest_first(trace: Trace, ego: str) -> dict[str, float]:
@@ -166,14 +178,26 @@ def from_behind(ego: ActorTrace, other: ActorTrace) -> bool:
 
 
 def side_and_course(ego: ActorTrace, other: ActorTrace, k: int) -> tuple[int, int]:
-    """Return side and course (see `conflict_type`) of another at an instant."""
-    cos, sin = math.cos(ego.heading[k]), math.sin(ego.heading[k])
-    dx, dy = other.x[k] - ego.x[k], other.y[k] - ego.y[k]
+    """Return side and course (see `conflict_type`) of another rectangle at an instant; of a contact, as they begin to touch.
+
+    A step may drive them a car's width and more into each other, or past each other where a contact ends the record.
+    """
+    k %= len(ego.x)
+    apart = np.flatnonzero(~(overlap_depth(ego, other)[: k + 1] > 0.0))
+    begun = int(apart[-1]) + 1 if apart.size else 0
+    touch = first_touch(ego, other, min(begun, k)) if begun <= k or k == len(ego.x) - 1 else None
+    return _side_and_course(*((rectangle_at(ego, k), rectangle_at(other, k)) if touch is None else touch[1:]))
+
+
+def _side_and_course(ego: Rectangles, other: Rectangles) -> tuple[int, int]:
+    heading, turned = float(ego.heading[0]), float(other.heading[0] - ego.heading[0])
+    cos, sin = math.cos(heading), math.sin(heading)
+    dx, dy = float(other.x[0] - ego.x[0]), float(other.y[0] - ego.y[0])
     along, across = cos * dx + sin * dy, cos * dy - sin * dx
-    turned = math.remainder(other.heading[k] - ego.heading[k], 2.0 * math.pi)
+    turned = math.remainder(turned, 2.0 * math.pi)
     c, s = abs(math.cos(turned)), abs(math.sin(turned))
-    outside_along = abs(along) - 0.5 * (ego.length + c * other.length + s * other.width)
-    outside_across = abs(across) - 0.5 * (ego.width + s * other.length + c * other.width)
+    outside_along = abs(along) - 0.5 * float(ego.length[0] + c * other.length[0] + s * other.width[0])
+    outside_across = abs(across) - 0.5 * float(ego.width[0] + s * other.length[0] + c * other.width[0])
     lengthwise = 0 if along >= 0 else 2
     side = lengthwise if outside_along >= outside_across else 1 if across > 0 else 3
     return side, round(turned / (0.5 * math.pi)) % 4

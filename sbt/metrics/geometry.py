@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -28,13 +28,16 @@ __all__ = [
     "contact_share",
     "corners",
     "farthest",
+    "first_touch",
     "overlap_depth",
     "part_pairs",
+    "rectangle_at",
     "rectangle_distance",
     "rectangles",
     "select_instants",
     "swept_contact",
     "time_to_contact",
+    "touching_first",
 ]  # fmt: skip
 
 
@@ -63,6 +66,12 @@ class Rectangles:
     heading: Vector
     length: Vector
     width: Vector
+
+
+def rectangle_at(actor: ActorTrace, k: int) -> Rectangles:
+    """Return the rectangle of an actor at an instant, as one of one."""
+    i = slice(k, k + 1)
+    return Rectangles(actor.x[i], actor.y[i], actor.heading[i], np.array([actor.length]), np.array([actor.width]))
 
 
 def rectangles(actor: ActorTrace) -> tuple[ActorTrace, ...]:
@@ -195,7 +204,17 @@ def contact_index(a: ActorTrace, b: ActorTrace) -> int | None:
 def contact_part(a: ActorTrace, b: ActorTrace) -> tuple[int, ActorTrace, ActorTrace] | None:
     """Return the index of the first contact (as `contact_index`) and the rectangles that touch; None if there is none."""
     found = [(k, p, q) for p, q in part_pairs(a, b) if (k := _rectangle_contact(p, q)) is not None]
-    return min(found, key=lambda one: one[0], default=None)
+    if len(found) < 2:
+        return found[0] if found else None
+    first = min(k for k, *_ in found)
+    return (first, *touching_first([(p, q) for k, p, q in found if k == first], first))
+
+
+def touching_first(pairs: Sequence[tuple[ActorTrace, ActorTrace]], k: int) -> tuple[ActorTrace, ActorTrace]:
+    """Return which of some pairs of rectangles touch first in the step before an instant; the first pair where none does."""
+    touches = [first_touch(p, q, k) for p, q in pairs]
+    shares = [math.inf if touch is None else touch[0] for touch in touches]
+    return pairs[shares.index(min(shares))]
 
 
 def contact_moment(a: ActorTrace, b: ActorTrace, k: int) -> float:
@@ -206,6 +225,51 @@ def contact_moment(a: ActorTrace, b: ActorTrace, k: int) -> float:
     step = slice(max(k - 1, 0), k + 1)
     pairs = part_pairs(select_instants(a, step), select_instants(b, step))
     return float(np.fmin(min(swept_contact(p, q)[-1] for p, q in pairs), 1.0))
+
+
+def first_touch(a: ActorTrace, b: ActorTrace, k: int) -> tuple[float, Rectangles, Rectangles] | None:
+    """Return after which share of the step before an instant two rectangles begin to touch, and both as they are then.
+
+    Within the step they move, and turn, as for `contact_index`. Where one of them was not there before and they overlap at the
+    instant, the share is 0, and they are as when they would have begun to at their present speeds and headings. None: they do not
+    touch.
+    """
+    if k == 0 or np.isnan(a.x[k - 1] + b.x[k - 1]):
+        return _touch_before(a, b, k)
+    turning = max(_swing(each, slice(k, k + 1))[0][0] for each in (a, b)) > _TURNED
+    (x, y, one), (u, v, other) = (_on_arc(each, k, 1.0) if turning else _on_chord(each, k) for each in (a, b))
+    shares = contact_share(one, other, u - x, v - y)
+    j = int(np.isfinite(shares).argmax())
+    if np.isinf(shares[j]):
+        return None
+    return (j + float(shares[j])) / len(x), _within(x, y, one, j, shares[j]), _within(u, v, other, j, shares[j])
+
+
+def _touch_before(a: ActorTrace, b: ActorTrace, k: int) -> tuple[float, Rectangles, Rectangles] | None:
+    """Return the same for two that nothing is known about before the instant."""
+    one, other = rectangle_at(a, k), rectangle_at(b, k)
+    cos, sin = _axes(one, other)
+    rate_x = b.speed[k] * np.cos(b.heading[k]) - a.speed[k] * np.cos(a.heading[k])
+    rate_y = b.speed[k] * np.sin(b.heading[k]) - a.speed[k] * np.sin(a.heading[k])
+    start = (other.x - one.x) * cos + (other.y - one.y) * sin
+    enter, leave = _overlap_span(start, rate_x * cos + rate_y * sin, _reaches(one, other, cos, sin))
+    if not enter[0] <= 0.0 <= leave[0]:
+        return None
+    if np.isfinite(enter[0]):
+        other = replace(other, x=other.x + enter * rate_x, y=other.y + enter * rate_y)
+    return 0.0, one, other
+
+
+def _on_chord(actor: ActorTrace, k: int) -> tuple[Vector, Vector, Rectangles]:
+    """Return what `_on_arc` does, in one part."""
+    return actor.x[k - 1 : k], actor.y[k - 1 : k], rectangle_at(actor, k)
+
+
+def _within(x: Vector, y: Vector, end: Rectangles, j: int, share: float) -> Rectangles:
+    """Return one of several rectangles after a share of its way to there from x and y."""
+    i = slice(j, j + 1)
+    to_x, to_y = x[i] + share * (end.x[i] - x[i]), y[i] + share * (end.y[i] - y[i])
+    return Rectangles(to_x, to_y, end.heading[i], end.length[i], end.width[i])
 
 
 def _rectangle_contact(a: ActorTrace, b: ActorTrace) -> int | None:
