@@ -2,6 +2,9 @@
 
 Where one of two is not there, its states are NaN: nothing touches it, and distances are NaN.
 
+Two persons are discs of their lesser size: SUMO turns who walks by up to 180 degrees within a step, however short, and nobody's
+shoulders touch another by that.
+
 The shape of a long vehicle is several rectangles (`ActorTrace.parts`): `contact_index`, `time_to_contact` and
 `rectangle_distance` compare all of them, the other functions single rectangles.
 """
@@ -16,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from sbt.metrics.discs import disc_span, discs_of
 from sbt.problem.arrays import Mask, Vector
 from sbt.problem.trace import ActorTrace, select_parts
 
@@ -89,6 +93,9 @@ def overlap_depth(a: ActorTrace, b: ActorTrace) -> Vector:
 
     The least overlap on the four axes; where they are apart, minus a lower bound of their distance.
     """
+    discs = discs_of(a, b)
+    if discs is not None:
+        return discs - np.hypot(b.x - a.x, b.y - a.y)
     cos, sin = _axes(a, b)
     apart: Vector = np.abs((b.x - a.x) * cos + (b.y - a.y) * sin)
     return (_reaches(a, b, cos, sin) - apart).min(axis=0)
@@ -153,6 +160,9 @@ def contact_share(a: ActorTrace | Rectangles, b: ActorTrace | Rectangles, dx: Ve
     end = end_x * cos + end_y * sin  # (4, t) centre distance along each axis
     start = dx * cos + dy * sin
     enter, leave = _overlap_span(start, end - start, reach)
+    discs = discs_of(a, b)
+    if discs is not None:
+        enter, leave = disc_span((enter, leave), dx, dy, end_x - dx, end_y - dy, discs)
     hit = (enter <= leave) & (leave >= 0) & (enter <= 1)
     return np.where(hit, np.maximum(enter, 0.0), np.inf)
 
@@ -192,6 +202,9 @@ def time_to_contact(a: ActorTrace, b: ActorTrace) -> Vector:
     rate_x = b.speed * np.cos(b.heading) - a.speed * np.cos(a.heading)
     rate_y = b.speed * np.sin(b.heading) - a.speed * np.sin(a.heading)
     enter, leave = _overlap_span(start, rate_x * cos + rate_y * sin, reach)
+    discs = discs_of(a, b)
+    if discs is not None:
+        enter, leave = disc_span((enter, leave), b.x - a.x, b.y - a.y, rate_x, rate_y, discs)
     return np.where((enter <= leave) & (leave >= 0), np.maximum(enter, 0.0), np.inf)
 
 
@@ -236,7 +249,7 @@ def first_touch(a: ActorTrace, b: ActorTrace, k: int) -> tuple[float, Rectangles
     """
     if k == 0 or np.isnan(a.x[k - 1] + b.x[k - 1]):
         return _touch_before(a, b, k)
-    turning = max(_swing(each, slice(k, k + 1))[0][0] for each in (a, b)) > _TURNED
+    turning = discs_of(a, b) is None and max(_swing(each, slice(k, k + 1))[0][0] for each in (a, b)) > _TURNED
     (x, y, one), (u, v, other) = (_on_arc(each, k, 1.0) if turning else _on_chord(each, k) for each in (a, b))
     shares = contact_share(one, other, u - x, v - y)
     j = int(np.isfinite(shares).argmax())
@@ -283,6 +296,8 @@ def _rectangle_contact(a: ActorTrace, b: ActorTrace) -> int | None:
     i = slice(first, int(near[-1]) + 1)
     touch = np.isfinite(swept_contact(select_instants(a, i), select_instants(b, i)))
     turns, drives = zip(_swing(a, i), _swing(b, i), strict=True)
+    if discs_of(a, b) is not None:
+        turns = np.zeros_like(turns[0]), np.zeros_like(turns[1])
     swing, wide = np.fmax(*turns), np.fmax(*(np.where(d, turn, 0.0) for turn, d in zip(turns, drives, strict=True))) > _SWINGS
     found = (k for k in (first + np.flatnonzero(touch | wide)).tolist())
     return next((k for k in found if _touch_in(a, b, k, turning=swing[k - first] > _TURNED, slid=bool(touch[k - first]))), None)
@@ -348,6 +363,9 @@ def rectangle_distance(a: ActorTrace, b: ActorTrace) -> Vector:
     """Return the (t,) smallest distance between the rectangles (m), 0 where they overlap."""
     if a.parts or b.parts:
         return np.minimum.reduce([rectangle_distance(p, q) for p, q in part_pairs(a, b)])
+    discs = discs_of(a, b)
+    if discs is not None:
+        return np.maximum(np.hypot(b.x - a.x, b.y - a.y) - discs, 0.0)
     cos, sin = _axes(a, b)
     along = np.abs((b.x - a.x) * cos + (b.y - a.y) * sin)
     overlap = (along <= _reaches(a, b, cos, sin)).all(axis=0)

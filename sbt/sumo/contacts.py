@@ -10,10 +10,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
-from sbt.metrics.geometry import overlap_depth
+import numpy as np
+
+from sbt.metrics.geometry import contact_part, overlap_depth
 from sbt.problem.outcome import LISTED_ONLY, UNCONFIRMED
 from sbt.problem.trace import ActorTrace
 
@@ -88,8 +90,20 @@ def unconfirmed_contact(
     """
     a, b = (_place(sumo, name, prefix, person=name in set(persons)) for name in (ego, other))
     depth = float(overlap_depth(*rectangles)[-1])
+    swung = [text for one, body in zip((a, b), rectangles, strict=True) if one.person and (text := _swung(one, body, rectangles))]
     size = f"bodies overlap by {depth:.2f} m" if depth > 0 else "bodies touch within the step and are apart at its end"
-    return f"{UNCONFIRMED}'{other}' at {t:.3f} s: {_why(sumo, a, b, set(moved))}; {size}"
+    return f"{UNCONFIRMED}'{other}' at {t:.3f} s: {'; '.join([_why(sumo, a, b, set(moved)), size, *swung])}"
+
+
+def _swung(person: _Place, body: ActorTrace, both: tuple[ActorTrace, ActorTrace]) -> str:
+    """Return by how much a person turned in the step of a contact that it would not have without; "" where it would."""
+    if len(body.heading) < 2:
+        return ""
+    before = [replace(one, heading=np.full(2, one.heading[0])) if one is body else one for one in both]
+    if contact_part(before[0], before[1]) is not None:
+        return ""
+    turned = abs(math.remainder(body.heading[1] - body.heading[0], math.tau))
+    return f"'{person.name}' touches as it turns by {math.degrees(turned):.0f} degrees within a step, else not"
 
 
 def listed_only(sumo: Any, ego: str, other: str, t: float, apart: float | None, *, persons: Iterable[str] = ()) -> str:
@@ -167,10 +181,10 @@ def _why(sumo: Any, a: _Place, b: _Place, moved: set[str]) -> str:
 
 
 def _why_person(person: _Place, vehicle: _Place) -> str:
-    if not person.junction:
-        return f"'{person.name}' walks on edge '{person.edge}', and SUMO compares pedestrians with vehicles only on crossings"
     if vehicle.person:
         return "SUMO does not compare pedestrians with each other"
+    if not person.junction:
+        return f"'{person.name}' walks on edge '{person.edge}', and SUMO compares pedestrians with vehicles only on crossings"
     if person.edge.rpartition("_")[2].startswith("w"):
         return (
             f"'{person.name}' is on the walking area '{person.edge}' beside lane '{vehicle.lane}', and SUMO compares pedestrians"
