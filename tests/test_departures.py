@@ -87,6 +87,46 @@ def test_who_appears_inside_or_right_before_the_ego_is_an_artefact(case, vehicle
     assert (status, bool(re.search(message, reason))) == ("invalid", True), reason
 
 
+FOLLOWERS: list[Any] = [
+    ("can stop", "", "7", ""),
+    ("decides rarely", 'actionStepLength="1"', "7", r"inf m/s\^2 of braking of 'other', which may act 0\.9 s late, would keep them apart \(tyres"),
+    ("decides rarely, but slow enough", 'actionStepLength="1"', "2", ""),
+    ("brakes weakly", 'decel="3" emergencyDecel="4"', "7", r"only 6\.\d+ m/s\^2 of braking would keep them apart \('other' can do 4\)"),
+]  # fmt: skip
+
+
+@pytest.mark.sumo
+@pytest.mark.parametrize(("attributes", "speed", "message"), [one[1:] for one in FOLLOWERS], ids=[one[0] for one in FOLLOWERS])
+def test_who_appears_behind_the_ego_can_brake_as_its_type_lets_it(case, attributes, speed, message):
+    """Within what tyres allow, but not within what SUMO lets the follower do: the ego was hit in every run."""
+    kind = f'<vType id="own" length="5" width="1.8" sigma="0" {attributes}/>'
+    vehicles = car("ego", "${p}", inner=stopped("road_0", 104)) + car("other", "95", depart="3", speed=speed, kind="own")
+    status, reason = case(kind + vehicles)
+    assert (status, bool(re.search(message, reason))) == ("invalid" if message else "ok", True), reason
+
+
+@pytest.mark.parametrize(("action", "limits", "message"), [
+    (0.1, (4.5, 9.0), ""), (0.5, (4.5, 9.0), r"so close to 'c' that only 54 m/s\^2 of braking of 'c', which may act 0\.4 s late"),
+    (0.1, (4.5, 5.5), r"that only 6\.02 m/s\^2 .*\('c' can do 5\.5\)"), (0.1, (8.0, 4.5), ""),
+])  # fmt: skip
+def test_an_ego_inserted_before_a_follower_starts_where_that_one_can_brake(action, limits, message):
+    ego, behind = State("ego", 5.0, 1.8), State("c", 5.0, 1.8)
+    ego.x, ego.speed, behind.x, behind.speed = 7.44, 5.64, 0.0, 11.06
+    states = {"ego": ego, "c": behind}
+    near = SimpleNamespace(states=states, newcomers=lambda: ["c"], body=lambda name: instant(states[name]), jumped=frozenset())
+    vehicle = SimpleNamespace(
+        getIDList=lambda: ("ego", "c"), getActionStepLength=lambda _: action, getDecel=lambda _: limits[0],
+        getEmergencyDecel=lambda _: limits[1],
+    )  # fmt: skip
+    simulation = SimpleNamespace(getTime=lambda: 120.0, getDeltaT=lambda: 0.1)
+    monitor = AppearanceMonitor(SimpleNamespace(simulation=simulation, vehicle=vehicle), "ego", SimpleNamespace())
+    if not message:
+        monitor._refuse_close(near, ["c"], "s.yaml:3:5: insert.ego: ", "move it")
+        return
+    with pytest.raises(RunError, match=message):
+        monitor._refuse_close(near, ["c"], "s.yaml:3:5: insert.ego: ", "move it")
+
+
 @pytest.mark.sumo
 def test_a_vehicle_that_the_user_puts_right_before_the_ego_is_a_scenario(case):
     """Its departure has a placeholder: the distance is an input, and the collision the result."""

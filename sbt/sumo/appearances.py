@@ -15,7 +15,7 @@ from sbt.problem.outcome import Status
 from sbt.problem.trace import ActorTrace
 from sbt.sumo.actors import State
 from sbt.sumo.off_lanes import parking
-from sbt.sumo.overlaps import deepest_overlap, instant, required_braking
+from sbt.sumo.overlaps import deepest_overlap, instant, is_behind, required_braking
 from sbt.sumo.places import inserted_at, said_at
 
 __all__ = ["AppearanceMonitor", "refuse_overlap_at_start"]
@@ -132,6 +132,15 @@ class AppearanceMonitor:
                 f"{_REMEDY}",
             )
 
+    def _ability(self, follower: str) -> tuple[float, float]:
+        """Return how hard one behind the ego can brake (m/s^2), and how much later than in the next step it may act (s)."""
+        vehicle = self._sumo.vehicle
+        if follower not in vehicle.getIDList():
+            return _MAX_BRAKING, 0.0
+        able = max(vehicle.getDecel(follower), vehicle.getEmergencyDecel(follower))
+        late = vehicle.getActionStepLength(follower) - self._sumo.simulation.getDeltaT()
+        return min(able, _MAX_BRAKING), max(late, 0.0)
+
     def _now(self) -> str:
         return f"t = {self._sumo.simulation.getTime():g} s"
 
@@ -149,12 +158,23 @@ class AppearanceMonitor:
     def _refuse_close(self, near: _Surroundings, names: Sequence[str], place: str, remedy: str) -> None:
         """Refuse others so close to the ego that nobody could react; `place`: of the ego, where it is the one who appears."""
         for name in names:
-            braking = required_braking(near.states[self._ego], near.states[name])
-            if braking > _MAX_BRAKING:
+            limit = self._needed(near.states[self._ego], near.states[name])
+            if limit:
                 who, whom = (self._ego, f"'{name}'") if place else (name, "the ego")
-                limit = f"{braking:.3g} m/s^2 of braking would keep them apart (tyres allow about {_MAX_BRAKING:g})"
                 raise RunError(
                     Status.INVALID,
                     f"{place}'{who}' must appear where drivers can react, but at {self._now()} it is so close to {whom} "
                     f"that only {limit}: {said_at(place, remedy)}",
                 )
+
+    def _needed(self, ego: State, other: State) -> str:
+        """Return which braking would keep the ego and another apart, if the one behind cannot brake so; else ""."""
+        braking, able, late = required_braking(ego, other), _MAX_BRAKING, 0.0
+        if 0.0 < braking <= able and is_behind(ego, other):
+            able, late = self._ability(other.name)
+            braking = required_braking(ego, other, late)
+        if braking <= able:
+            return ""
+        after = f" of '{other.name}', which may act {late:.3g} s late," if late > 0.0 else ""
+        what = f"tyres allow about {able:g}" if able == _MAX_BRAKING else f"'{other.name}' can do {able:g}"
+        return f"{braking:.3g} m/s^2 of braking{after} would keep them apart ({what})"

@@ -12,7 +12,7 @@ from sbt.metrics.geometry import overlap_depth, part_pairs
 from sbt.problem.trace import ActorTrace
 from sbt.sumo.actors import State
 
-__all__ = ["Rectangle", "deepest_overlap", "instant", "required_braking", "separate", "state_in_sumo"]
+__all__ = ["Rectangle", "deepest_overlap", "instant", "is_behind", "required_braking", "separate", "state_in_sumo"]
 
 Rectangle = tuple[float, float, float, float, float]
 """x, y (m), heading (rad), length and width (m)."""
@@ -42,10 +42,11 @@ def deepest_overlap(ego: ActorTrace, others: Mapping[str, ActorTrace]) -> tuple[
     return found
 
 
-def required_braking(ego: State, other: State) -> float:
+def required_braking(ego: State, other: State, delay: float = 0.0) -> float:
     """Return the constant deceleration (m/s^2) by which the one behind avoids the one ahead, which keeps its speed.
 
-    0 where they do not drive in one direction, one behind the other, or the gap grows; inf without a gap.
+    0 where they do not drive in one direction, one behind the other, or the gap grows; inf without a gap. A delay is the time (s)
+    until the one behind begins to brake.
     """
     if ego.cos * other.cos + ego.sin * other.sin < _SAME_DIRECTION:
         return 0.0
@@ -54,10 +55,15 @@ def required_braking(ego: State, other: State) -> float:
     if abs(across) >= 0.5 * (ego.width + other.width):
         return 0.0
     closing = ego.speed - other.speed if along > 0 else other.speed - ego.speed
-    gap = abs(along) - 0.5 * (ego.length + other.length)
     if closing <= 0.0:
         return 0.0
+    gap = abs(along) - 0.5 * (ego.length + other.length) - closing * delay
     return closing**2 / (2.0 * gap) if gap > 0.0 else math.inf
+
+
+def is_behind(ego: State, other: State) -> bool:
+    """Return whether the other's middle is behind the ego's."""
+    return (other.x - ego.x) * ego.cos + (other.y - ego.y) * ego.sin < 0.0
 
 
 def state_in_sumo(domain: Any, name: str, *, person: bool = False) -> State:
