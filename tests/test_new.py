@@ -150,3 +150,24 @@ def test_placeholders_that_are_there_are_the_inputs(tmp_path):
     assert ranges == {"gap": (0.0, 1.0, ""), "v": (0.0, 15.0, "m/s")}
     again = CliRunner().invoke(app, ["new", str(tmp_path / "t"), "--from", str(tmp_path / "s" / "scenario.yaml")])
     assert (again.exit_code, "--from must be a SUMO configuration (.sumocfg)" in again.output) == (2, True)
+
+
+@pytest.mark.sumo
+@pytest.mark.parametrize("busy", [True, False])
+def test_an_ego_with_placeholders_of_its_own_waits_for_a_gap_where_runs_are_only_right_so(tmp_path, busy):
+    (tmp_path / "r.net.xml").write_text(
+        '<net version="1.20"><edge id="e" from="a" to="b"><lane id="e_0" index="0" speed="30" length="900" shape="0,0 900,0"/></edge>'
+        '<junction id="a" type="dead_end" x="0" y="0" incLanes="" intLanes="" shape=""/>'
+        '<junction id="b" type="dead_end" x="900" y="0" incLanes="e_0" intLanes="" shape=""/></net>'
+    )
+    (tmp_path / "r.rou.xml").write_text(
+        f'<routes><vehicle id="0" depart="0" departPos="{12 if busy else 300}"><route edges="e"/><stop lane="e_0" endPos="{20 if busy else 400}" duration="4"/></vehicle>'
+        '<vehicle id="av" depart="1" departSpeed="${v}"><route edges="e"/></vehicle></routes>'
+    )
+    (tmp_path / "my.sumocfg").write_text(
+        '<configuration><net-file value="r.net.xml"/><route-files value="r.rou.xml"/></configuration>'
+    )
+    said = called("new", tmp_path / "s", "--from", tmp_path / "my.sumocfg", "--ego", "av")
+    assert "3 of 3 runs are right" in said
+    assert ("\n  delay: 10  " in (tmp_path / "s" / "scenario.yaml").read_text()) == busy
+    assert {path.name for path in (tmp_path / "s").iterdir()} == {"scenario.yaml", "campaign.yaml"}

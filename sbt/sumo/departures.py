@@ -24,8 +24,10 @@ from sbt.sumo.places import place_in, said_at
 from sbt.sumo.template import fill
 from sbt.sumo.waiting import why_held_back
 
-__all__ = ["DepartureMonitor", "RequestedDeparture", "WaitingEgo", "number_or_none", "requested_departures"]
+__all__ = ["HELD_BACK", "DepartureMonitor", "RequestedDeparture", "WaitingEgo", "number_or_none", "requested_departures"]
 
+HELD_BACK = "SUMO holds it back"
+"""What is said of a vehicle that the traffic does not let in."""
 _TOLERANCE = 1e-3
 """Difference that is accepted (m, m/s)."""
 
@@ -222,7 +224,7 @@ class DepartureMonitor:
         gap, why, remedy = why_held_back(self._sumo, name, requested, self._files)
         longer = " longer" if self._ego.delay or requested.of_flow else ""
         tolerance = f", or let it wait{longer}: ego: {{delay: SECONDS}}" if is_ego else ""
-        held = f"but SUMO holds it back, as {why}: {said_at(requested.place, remedy)}{tolerance}"
+        held = f"but {HELD_BACK}, as {why}: {said_at(requested.place, remedy)}{tolerance}"
         raise RunError(Status.INVALID, f"{rule}{f', {gap}' if gap else ''}, {held}")
 
     def _refuse_copy(self, name: str, place: str) -> None:

@@ -6,13 +6,14 @@ import json
 import os
 import time
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from sbt.config.scenario_file import from_file
 from sbt.errors import InputError, RunError, did_you_mean
 from sbt.files import write_atomically
 from sbt.plugins import forget_changed
+from sbt.sumo.departures import HELD_BACK
 from sbt.sumo.files import SumoFiles, options_of_config
 from sbt.sumo.observing import Observed, Traffic, candidates, observe
 from sbt.sumo.own_ego import Suggestion, own_ego
@@ -130,11 +131,12 @@ class _Trial:
 
 @dataclass(frozen=True)
 class _Draft:
-    """A scenario before it is written: the texts of its files, and why it has this ego."""
+    """A scenario before it is written: the texts of its files, why it has this ego, and the one in which the ego may wait."""
 
     texts: Mapping[Path, str | bytes]
     scenario: str
     why: str
+    patient: str = ""
 
 
 def write_scenario(folder: Path, config: Path, ego: str | None = None) -> Written:
@@ -159,9 +161,8 @@ def write_scenario(folder: Path, config: Path, ego: str | None = None) -> Writte
         raise InputError(f"--ego must be a vehicle of the files ({known}), but got '{ego}'{did_you_mean(ego, names)}")
     best: tuple[_Trial, _Draft] | None = None
     made: set[Path] = set()
-    for draft in _drafts(files, config, folder, ego):
-        _write(draft, folder, made)
-        trial = _tried(folder / "scenario.yaml")
+    for each in _drafts(files, config, folder, ego):
+        trial, draft = _settled(each, folder, made)
         if best is None or trial.rank < best[0].rank:
             best = trial, draft
         if trial.fine:
@@ -232,20 +233,23 @@ def _with_placeholders(
     ego = ego or next(iter([*named, *varying, *vehicles, *(f"{name}.0" for name in files.names())]), None)
     if ego is None:
         raise InputError(f"{config}: the files must have a vehicle, trip or flow, but have none")
-    scenario = _scenario(files, config, folder, ego, inputs, "choose another one here, where it is not yours", "", None)
-    return _Draft({}, scenario, f"'{ego}'; the inputs are the placeholders of the files")
+    at_once, patient = (
+        _scenario(files, config, folder, ego, inputs, "choose another one here, where it is not yours", "", None, delay=delay)
+        for delay in ("", _DELAY)
+    )
+    return _Draft({}, at_once, f"'{ego}'; the inputs are the placeholders of the files", patient)
 
 
 def _scenario(
     files: SumoFiles, config: Path, folder: Path, ego: str, inputs: tuple[Suggestion, ...], why: str, named: str,
-    chosen: Observed | None,
+    chosen: Observed | None, *, delay: str = _DELAY,
 ) -> str:  # fmt: skip
     duration = _DURATION
     if chosen is not None:
         duration = round(max(_SHORTEST, min(max(_DURATION, chosen.busiest + _AFTER), chosen.stay, _LONGEST)))
     return _SCENARIO.format(
         folder=folder, config=_shown(config, folder), files=named, ego=json.dumps(ego, ensure_ascii=False), why=why,
-        duration=duration, delay=_DELAY if chosen is not None else "", first=inputs[0].name if inputs else "name",
+        duration=duration, delay=delay, first=inputs[0].name if inputs else "name",
         step="" if files.step_length() is not None else f"step_length: {_STEP}            # SUMO's own default is 1 s\n",
         inputs="".join(f"  {s.name}: {_entry(s)}\n" for s in inputs),
     )  # fmt: skip
@@ -276,6 +280,18 @@ def _write(draft: _Draft, folder: Path, made: set[Path]) -> None:
             raise InputError(f"FOLDER must not have a {path.name} yet, but '{folder}' has: choose another folder")
         made.add(write_atomically(path, text))
     forget_changed()
+
+
+def _settled(draft: _Draft, folder: Path, made: set[Path]) -> tuple[_Trial, _Draft]:
+    """Write and try a draft; where SUMO holds the ego back, with a delay, which stays if more runs are right with it."""
+    _write(draft, folder, made)
+    trial = _tried(folder / "scenario.yaml")
+    if not draft.patient or not any(HELD_BACK in problem for problem in trial.problems):
+        return trial, draft
+    waits = replace(draft, scenario=draft.patient)
+    _write(waits, folder, made)
+    later = _tried(folder / "scenario.yaml")
+    return (later, waits) if later.rank < trial.rank else (trial, draft)
 
 
 def _tried(path: Path) -> _Trial:
