@@ -316,10 +316,8 @@ def _rows(settings: Settings, log: Log, taken: Points | None) -> PoolSequence:
     if scenario.pool is None:
         raise ValueError("only a recorded table has rows")
     u = np.clip(scenario.space.to_unit(scenario.pool.x), 0.0, 1.0)
-    gone = scenario.pool.taken(log.planned.x)
-    if taken is not None and len(taken):
-        gone = gone | scenario.pool.taken(taken)
-    return PoolSequence(u, gone, settings.seed)
+    gone = log.planned.x if taken is None else np.concatenate([log.planned.x, taken])
+    return PoolSequence(u, scenario.pool.taken(gone), settings.seed)
 
 
 def _greedy(

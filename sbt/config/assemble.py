@@ -178,13 +178,15 @@ def _requirement(loaded: Loaded, scenario: LogicalScenario, problems: Problems) 
             problems.add(("requirement", "critical"), f"it needs a metric: the scenario's own requirement is {own.metric}")
         return own
     metric = own.metric if change.metric is None else change.metric
+    if change.critical is None and metric == own.metric:
+        return own
     if metric not in scenario.measured:
         problems.add(("requirement", "metric"), must_be_measured(metric, scenario.measured))
         return own
-    if change.critical is None and metric != own.metric:
+    if change.critical is None:
         problems.add(("requirement",), f"critical: [low, high] is required with the metric {metric}")
         return own
-    return Requirement(metric, *((own.low, own.high) if change.critical is None else change.critical))
+    return Requirement(metric, *change.critical)
 
 
 def _metamodel(loaded: Loaded, problems: Problems) -> Metamodel | None:

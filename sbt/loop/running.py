@@ -25,6 +25,7 @@ from sbt.loop.learner import FittedMetamodel
 from sbt.loop.stages import BACK, Batch, Campaign, Conclusion, Facts, Log, LooksAhead, Progress, Shard, Stage, proposed
 from sbt.problem.outcome import Job
 from sbt.problem.plain import Json
+from sbt.problem.pool import Pool
 from sbt.problem.requirement import Requirement
 from sbt.seeds import run_seeds
 from sbt.store.database import Store
@@ -84,7 +85,8 @@ def run_stages(
     driver.counter.count_all(store.history())
     while k < len(campaign.stages):
         later = {stage.name for stage in campaign.stages[k + 1 :]} - {stage.name for stage in campaign.stages[: k + 1]}
-        reason = _StageLoop(campaign.stages[k], driver, executor, frozenset(later)).run(sent_back=reason == BACK)
+        loop = _StageLoop(campaign.stages[k], driver, executor, frozenset(later), campaign.recorded)
+        reason = loop.run(sent_back=reason == BACK)
         k = 0 if reason == BACK else k + 1
     log = _log(store, 0)
     driver.counter.tell("concluding")
@@ -126,12 +128,14 @@ class _StageLoop:
         driver: writes them.
         executor: runs them; where that leaves this process idle, a stage that looks ahead chooses meanwhile.
         later: stages after it, whose batches it waits for.
+        recorded: the rows that runs are; None: they are run.
     """
 
     stage: Stage
     driver: Driver
     executor: Executor
     later: frozenset[str]
+    recorded: Pool | None = None
     _queue: deque[Job] = field(default_factory=deque)
     _planned: deque[Iterator[Job]] = field(default_factory=deque)
     _thought: _Thought | None = None
@@ -183,7 +187,8 @@ class _StageLoop:
                 counter.iteration = len(iterations)
                 if unfinished is None:
                     counter.tell(f"{self.stage.name}: choosing")
-                self._thought = _Thought(self.stage, _log(store, ahead, self.later), apart=ahead > 0 and is_apart(self.executor))
+                apart = ahead > 0 and is_apart(self.executor)
+                self._thought = _Thought(self.stage, _log(store, ahead, self.later), self.recorded, apart=apart)
             if not self._thought.ended:
                 return
             thought, self._thought = self._thought, None
@@ -203,9 +208,9 @@ class _StageLoop:
 class _Thought:
     """Whether a stage is over, or its next batch; here and now, or beside what else this process does."""
 
-    def __init__(self, stage: Stage, log: Log, *, apart: bool):
+    def __init__(self, stage: Stage, log: Log, recorded: Pool | None, *, apart: bool):
         self.log, self.seconds = log, 0.0
-        self._stage = stage
+        self._stage, self._recorded = stage, recorded
         self._found: str | Batch | None = None
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._think, name="sbt-thinker", daemon=True) if apart else None
@@ -218,7 +223,7 @@ class _Thought:
         start = time.perf_counter()
         try:
             stopped = self._stage.stop(self.log)
-            self._found = stopped if stopped is not None else proposed(self._stage, self.log)
+            self._found = stopped if stopped is not None else proposed(self._stage, self.log, self._recorded)
         except BaseException as error:  # raised again where it is waited for
             self._error = error
         self.seconds = time.perf_counter() - start
@@ -293,7 +298,7 @@ def _ahead(campaign: Campaign, rows: Rows) -> list[tuple[str, Batch]]:
     batches: list[tuple[str, Batch]] = []
     for stage in campaign.stages:
         while stage.stop(log := Log(rows.history(), tuple(iterations), ())) is None:
-            batch = proposed(stage, log)
+            batch = proposed(stage, log, campaign.recorded)
             x = as_numbers([[run.inputs[name] for name in rows.names] for run in batch.runs], rows.names, rows.choices)
             n = len(batch.runs)
             columns = {

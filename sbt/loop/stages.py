@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Protocol, TypeVar, runtime_checkable
 
@@ -11,15 +11,16 @@ from sbt.errors import InputError
 from sbt.loop.learner import FittedMetamodel
 from sbt.problem.outcome import Doubt
 from sbt.problem.plain import Json
+from sbt.problem.pool import Pool
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
 from sbt.store.database import PlannedRun
-from sbt.store.history import History
+from sbt.store.history import History, as_numbers
 from sbt.store.records import FitRecord, Iteration
 
 __all__ = [
     "BACK", "Batch", "Campaign", "Conclusion", "Facts", "Log", "LooksAhead", "Progress", "Shard", "Stage", "few_combinations",
-    "proposed", "sentences_of",
+    "notes_of", "proposed", "sentences_of",
 ]  # fmt: skip
 
 _FEW = 4096
@@ -104,6 +105,7 @@ class Facts:
         combinations: of the inputs, where all are whole numbers or choices and there are at most 4,096; None: otherwise.
         meanings: of metrics, by name.
         recorded: its runs are recorded rows; there are no others.
+        notes: in sentences, what is to be known of these rows.
     """
 
     history: History
@@ -114,6 +116,7 @@ class Facts:
     combinations: int | None = None
     meanings: Mapping[str, str] = field(default_factory=dict)
     recorded: bool = False
+    notes: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, history: History, scenario: LogicalScenario) -> Facts:
@@ -121,7 +124,8 @@ class Facts:
         return cls(
             history, scenario.requirement, scenario.unit, scenario.name, scenario.units, few_combinations(scenario),
             {m.name: m.description for m in scenario.metrics if m.description}, scenario.pool is not None,
-        )
+            notes_of(scenario),
+        )  # fmt: skip
 
 
 def sentences_of(conclusion: Conclusion, facts: Facts) -> list[str]:
@@ -140,7 +144,13 @@ def sentences_of(conclusion: Conclusion, facts: Facts) -> list[str]:
         which = f"In {dead:,} of {len(facts.history):,} runs another road user brakes as no vehicle can"
         said = [*said, f"{which} (column unconfirmed); SUMO lets one do so before a red light or where its lane ends."]
     bare = [part.metric for part in facts.requirement.parts if not facts.units.get(part.metric)]
-    return said and [*said, *(f"{metric}: {facts.meanings[metric]}." for metric in bare if metric in facts.meanings)]
+    meant = [f"{metric}: {facts.meanings[metric]}." for metric in bare if metric in facts.meanings]
+    return said and [*said, *meant, *facts.notes]
+
+
+def notes_of(scenario: LogicalScenario) -> tuple[str, ...]:
+    """Return in sentences what is to be known of the rows of a recorded table; nothing of a scenario that is run."""
+    return () if scenario.pool is None else scenario.pool.told(scenario.requirement)
 
 
 def few_combinations(scenario: LogicalScenario) -> int | None:
@@ -177,8 +187,8 @@ class LooksAhead(Stage, Protocol):
         ...
 
 
-def proposed(stage: Stage, log: Log) -> Batch:
-    """Return the stage's next batch.
+def proposed(stage: Stage, log: Log, recorded: Pool | None = None) -> Batch:
+    """Return the stage's next batch; of `recorded` inputs with several rows, the seed says which of them.
 
     Raises:
         InputError: it has no runs.
@@ -186,7 +196,13 @@ def proposed(stage: Stage, log: Log) -> Batch:
     batch = stage.propose(log)
     if not batch.runs:
         raise InputError(f"stage {stage.name} must propose runs or stop, but it did neither")
-    return batch
+    if recorded is None or not recorded.repeats:
+        return batch
+    known = log.planned
+    x = as_numbers([[run.inputs[name] for name in known.names] for run in batch.runs], known.names, known.choices)
+    numbers = recorded.numbers(known.x, x)
+    runs = [r if k is None else replace(r, seed=k, blind=True) for r, k in zip(batch.runs, numbers, strict=True)]
+    return replace(batch, runs=runs)
 
 
 @dataclass(frozen=True)
@@ -198,11 +214,13 @@ class Campaign:
         conclude: gives the conclusion, and the metamodel that was fitted for it.
         depends: how batches, or when they end, depend on results; None: not at all, so that all runs
             can be planned ahead and shared out.
+        recorded: the rows that runs are; None: they are run.
     """
 
     stages: tuple[Stage, ...]
     conclude: Callable[[Log], tuple[Conclusion, FittedMetamodel | None]]
     depends: str | None = "each batch depends on all results before it"
+    recorded: Pool | None = None
 
 
 @dataclass(frozen=True)

@@ -5,17 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any, Protocol, runtime_checkable
 
-import numpy as np
-
 from sbt.errors import InputError, RunError, did_you_mean, must_be, must_take
-from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.metric import Metric, meaningful, metric_from
 from sbt.problem.outcome import Status
 from sbt.problem.parameter import Parameter
 from sbt.problem.plain import Values
+from sbt.problem.pool import Pool
 from sbt.problem.requirement import Requirement
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import Trace
@@ -82,32 +79,6 @@ class OnRoads(Protocol):
     def with_friction(self, low: float, high: float) -> Simulate:
         """Return a copy on roads of this coefficient of friction, an input where it is a range."""
         ...
-
-
-@dataclass(frozen=True, eq=False)
-class Pool:
-    """Recorded outcomes to choose among instead of simulating: x (n, d), metrics of (n,) each."""
-
-    x: Points
-    metrics: Mapping[str, Vector]
-
-    @cached_property
-    def _rows(self) -> dict[bytes, int]:
-        return {row.tobytes(): k for k, row in enumerate(self.x)}
-
-    def y(self, metric: str) -> Vector:
-        """Return (n,) values of a metric."""
-        return self.metrics[metric]
-
-    def row(self, x: Vector) -> int | None:
-        """Return the index of the row with exactly these inputs, None where there is none."""
-        return self._rows.get(np.ascontiguousarray(x, dtype=np.float64).tobytes())
-
-    def taken(self, x: Points) -> Mask:
-        """Return (n,) booleans: the row is among the points (m, d)."""
-        mask = np.zeros(len(self.x), dtype=bool)
-        mask[[k for k in map(self.row, x) if k is not None]] = True
-        return mask
 
 
 @dataclass(frozen=True)

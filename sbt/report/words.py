@@ -13,7 +13,7 @@ from sbt.campaigns.lost import nothing_known
 from sbt.campaigns.parts import share_among_held_out
 from sbt.campaigns.wording import number, percent, requirement_words, written_unit
 from sbt.estimators.binomial import upper
-from sbt.loop.stages import Conclusion, Facts, few_combinations, sentences_of
+from sbt.loop.stages import Conclusion, Facts, few_combinations, notes_of, sentences_of
 from sbt.problem.outcome import Doubt
 from sbt.problem.parameter import Parameter
 from sbt.problem.plain import JsonMapping
@@ -68,6 +68,7 @@ class Findings:
         combinations: of the inputs, where they are few.
         meanings: of metrics, by name.
         recorded: its runs are recorded rows.
+        notes: in sentences, what is to be known of these rows.
     """
 
     history: History
@@ -84,6 +85,7 @@ class Findings:
     combinations: int | None = None
     meanings: Mapping[str, str] = field(default_factory=dict)
     recorded: bool = False
+    notes: tuple[str, ...] = ()
 
     @classmethod
     def of(
@@ -98,6 +100,7 @@ class Findings:
             validation, store.counts.get(PLANNED, 0), scenario.direction,
             scenario.units, scenario.name, few_combinations(scenario),
             {m.name: m.description for m in scenario.metrics if m.description}, scenario.pool is not None,
+            notes_of(scenario),
         )  # fmt: skip
 
     @property
@@ -114,7 +117,8 @@ class Findings:
     def facts(self) -> Facts:
         """What the conclusion's own sentences may refer to."""
         return Facts(
-            self.history, self.requirement, self.unit, self.scenario, self.units, self.combinations, self.meanings, self.recorded
+            self.history, self.requirement, self.unit, self.scenario, self.units, self.combinations, self.meanings, self.recorded,
+            self.notes,
         )  # fmt: skip
 
 

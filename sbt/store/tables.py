@@ -16,19 +16,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sbt.errors import InputError, RunError
+from sbt.problem.arrays import Vector
 from sbt.problem.outcome import Status
 from sbt.problem.parameter import Parameter
 from sbt.problem.plain import Values
+from sbt.problem.pool import Pool
 from sbt.problem.requirement import Requirement
-from sbt.problem.scenario import LogicalScenario, Pool
+from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.store.history import History, named_columns
 
 __all__ = ["from_folder", "to_folder"]
 
 _SUFFIXES = (".parquet", ".csv")
+_SEED = "seed"
+"""Column that tells repeats of inputs from copies of a row, where it is no input and no output."""
 
 
 def from_folder(name: str, folder: Path) -> LogicalScenario:
@@ -54,14 +59,12 @@ def from_folder(name: str, folder: Path) -> LogicalScenario:
     if missing or not inputs or not outputs:
         absent = ", ".join(missing) or "all"
         raise InputError(f"{table}: every input and output of config.yml must be a column, but missing: {absent}")
-    complete = np.flatnonzero(np.all([np.isfinite(rows[column]) for column in [*inputs, *outputs]], axis=0))
-    x = np.column_stack([rows[column] for column in inputs])
-    kept = complete[np.sort(np.unique(x[complete], axis=0, return_index=True)[1])]  # of equal inputs the first
-    x = x[kept]
+    kept, notes = _kept(rows, [*inputs], [*outputs])
+    x = np.column_stack([rows[column] for column in inputs])[kept]
     if len(x) < 2:
         raise InputError(f"{table}: a table needs at least two complete rows, but got {len(x)}")
     space = ParameterSpace(tuple(_parameter(key, entry, x[:, k]) for k, (key, entry) in enumerate(inputs.items())))
-    pool = Pool(x, {column: rows[column][kept] for column in outputs})
+    pool = Pool(x, {column: rows[column][kept] for column in outputs}, notes)
     title, text = str(described.get("title", path.name)), str(described.get("logical_scenario", ""))
     return LogicalScenario(
         name=f"table:{name}", space=space, requirement=Requirement(next(iter(outputs)), high=0.0),
@@ -69,14 +72,35 @@ def from_folder(name: str, folder: Path) -> LogicalScenario:
     )  # fmt: skip
 
 
+def _kept(rows: Mapping[str, Vector], inputs: list[str], outputs: list[str]) -> tuple[NDArray[np.intp], tuple[str, ...]]:
+    """Return the rows that are runs, and in a sentence how many are none.
+
+    A run has finite inputs and all outputs, which may be infinite. Rows of the same inputs are copies of one run where they
+    have the same seed, or, of a table without seeds, where nowhere the same inputs have other outputs.
+    """
+    x, y = (np.column_stack([rows[column] for column in columns]) + 0.0 for columns in (inputs, outputs))  # zero has no sign
+    complete = np.flatnonzero(np.isfinite(x).all(axis=1) & ~np.isnan(y).any(axis=1))
+    x, y = x[complete], y[complete]
+    seeded = _SEED in rows and _SEED not in [*inputs, *outputs]
+    same = np.column_stack([x, rows[_SEED][complete]]) if seeded else x
+    drawn = not seeded and len(np.unique(np.column_stack([x, y]), axis=0)) > len(np.unique(x, axis=0))
+    kept = complete if drawn else complete[np.sort(np.unique(same, axis=0, return_index=True)[1])]
+    every = len(rows[inputs[0]])
+    why = [f"{n:,} {what}" for n, what in (
+        (every - len(complete), "without a number in some column"), (len(complete) - len(kept), "the same as another one"),
+    ) if n]  # fmt: skip
+    said = f"{every - len(kept):,} of {every:,} rows are left out: {', '.join(why)}."
+    return kept, (said,) if why else ()
+
+
 class _Lookup:
-    """Gives the recorded outcome of exactly these inputs."""
+    """Gives the recorded outcome of exactly these inputs; of several, the seed says which."""
 
     def __init__(self, space: ParameterSpace, pool: Pool):
         self._space, self._pool = space, pool
 
     def __call__(self, values: Values, seed: int) -> dict[str, float]:
-        row = self._pool.row(self._space.numbers(values))
+        row = self._pool.row(self._space.numbers(values), seed)
         if row is None:
             raise RunError(Status.INVALID, f"a recorded table has only its own rows, but none with {dict(values)}")
         return {name: float(column[row]) for name, column in self._pool.metrics.items()}
@@ -92,7 +116,8 @@ def to_folder(history: History, scenario: LogicalScenario, folder: Path, suffix:
         suffix: `.csv`, or `.parquet` where pyarrow is installed.
 
     Returns:
-        The table's file; `from_folder` reads the folder back to the same rows.
+        The table's file; `from_folder` reads the folder back to the same rows. Its column `seed` tells repeats of inputs from
+        copies of a row; it is left out where an input or a metric has that name.
     """
     import pandas as pd
     from ruamel.yaml import YAML
@@ -114,6 +139,7 @@ def to_folder(history: History, scenario: LogicalScenario, folder: Path, suffix:
     with (folder / "config.yml").open("w", encoding="utf-8") as file:
         YAML().dump(described, file)
     columns = named_columns(done.x, done.names, done.choices) | {name: done.y(name) for name in done.metrics}
+    columns = columns | ({} if _SEED in columns else {_SEED: done.seed})
     path = folder / f"runs{suffix}"
     frame = pd.DataFrame(columns)
     frame.to_csv(path, index=False) if suffix == ".csv" else frame.to_parquet(path, index=False)

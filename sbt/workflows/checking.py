@@ -32,7 +32,7 @@ from sbt.sumo.suggesting import units_apart
 from sbt.workflows.comparing import compared_times
 from sbt.workflows.drawn import covariates_first
 from sbt.workflows.fidelity import fidelity_findings
-from sbt.workflows.findings import Finding
+from sbt.workflows.findings import Finding, row_findings, some_rows
 from sbt.workflows.rehearsal import rehearse
 from sbt.workflows.snapshots import snapshot_findings, which_isolation
 
@@ -114,7 +114,8 @@ def findings_of(spec: ScenarioSpec, seed: int = 0, scenario: LogicalScenario | N
 def _findings(spec: ScenarioSpec, seed: int, scenario: LogicalScenario | None) -> Iterator[Finding]:
     asked = scenario if scenario is not None else spec.resolve()
     yield from which_isolation(spec)
-    points = list(_points(asked.space))
+    yield from row_findings(asked)
+    points = some_rows(asked) or list(_points(asked.space))
     jobs = [(values, run_seed(seed, k)) for k, values in enumerate(points)]
     drawn = covariates_first(asked, jobs)
     other = _elsewhere(spec, jobs)
@@ -135,7 +136,8 @@ def _findings(spec: ScenarioSpec, seed: int, scenario: LogicalScenario | None) -
         return
     again = _runs(spec, jobs[::-1])[::-1]
     yield _equal("same seed, same trace", first, again, points)
-    yield from _idle(spec, asked.space, jobs, seed)
+    if asked.pool is None:
+        yield from _idle(spec, asked.space, jobs, seed)
     yield from drawn()
     same = "same seed, same trace in a worker process"
     yield Finding(same, ok=False, detail=other.why) if isinstance(other, _Lost) else _equal(same, first, other, points)

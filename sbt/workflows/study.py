@@ -326,7 +326,7 @@ class Study:
         if self.config.ahead and not any(ahead_of(stage) for stage in found.stages):
             kind, how = self.config.campaign, self.config.acquisition.kind
             raise InputError(f"batch.ahead must be 0 where each batch needs all results before it, as in {kind} by {how}")
-        return found
+        return replace(found, recorded=self.scenario.pool)
 
     @property
     def budget(self) -> int:
