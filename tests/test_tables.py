@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from sbt.config.load import parse
 from sbt.errors import InputError
 from sbt.execution.spec import ScenarioSpec
 from sbt.plugins import Scope, load
+from sbt.problem.combination import CombinedRequirement
 from sbt.samplers.pool import PoolSequence
 from sbt.seeds import stream
 from sbt.store.database import Store
@@ -205,3 +207,73 @@ def test_what_is_left_out_of_a_table_is_said(folder: Path) -> None:
     found = run_study(Study(parse(configuration(folder, "coverage", "s"), folder=folder)), report=False)
     assert any(said in sentence for sentence in found.sentences)
     assert any(said in finding.detail for finding in check_scenario(ScenarioSpec(f"table:{folder}", str(folder))))
+
+
+def rates(values: dict[str, float], seed: int) -> dict[str, float]:
+    """A metric of a rate over five decades."""
+    return {"m": float(np.log10(values["rate"])) + values["a"] / 10, "other": values["a"]}
+
+
+LOW_RATE = sbt.Requirement("m", high=-2.5)
+RATES = sbt.Scenario(
+    "rates", [sbt.Parameter("rate", 1e-4, 10, "", sbt.LogNormal(mean=0.01, std=0.05)), sbt.Parameter("a", 0, 10, "m")], LOW_RATE,
+    evaluate=rates, metrics=["other", "m"],
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with 300 runs even in the logarithm of a rate, of which 21 % are critical."""
+    made = sbt.run(
+        campaign="coverage", scenario=RATES, budget=300, seed=1, executor="serial", report=False,
+        store=tmp_path_factory.mktemp("rates") / "made",
+    )  # fmt: skip
+    return made.export("dsiod").parent
+
+
+def asked_again(table: Path, store: Path, **more: object) -> sbt.Result:
+    return sbt.run(scenario=f"table:{table}", budget=100, seed=1, executor="serial", report=False, store=store, **more)
+
+
+def test_a_table_of_an_export_asks_what_its_campaign_asked(exported: Path, tmp_path: Path) -> None:
+    """It asked whether the first metric is at most 0."""
+    assert load("scenarios", f"table:{exported}").requirement == LOW_RATE
+    found = asked_again(exported, tmp_path / "s", campaign="coverage")
+    assert "m ≤ -2.5" in found.sentences()[0]
+    assert "assumed" not in " ".join(found.sentences())
+
+
+@pytest.mark.parametrize("how", ["any", "all"])
+def test_requirements_of_several_metrics_are_kept_with_the_rows(how: str, tmp_path: Path) -> None:
+    named = sbt.Requirement("other", low=2.0, high=3.5, name="in the middle")
+    need = CombinedRequirement(how=how, items=(LOW_RATE, named))
+    scenario = replace(RATES, requirement=need)
+    made = sbt.run(campaign="coverage", scenario=scenario, budget=20, executor="serial", report=False, store=tmp_path / "s")
+    table = made.export("dsiod").parent
+    assert load("scenarios", f"table:{table}").requirement == need
+    critical = asked_again(table, tmp_path / "t", campaign="coverage").frame["critical"]
+    assert critical.sum() == made.frame["critical"].sum()
+
+
+def test_a_requirement_that_nobody_stated_is_told_as_assumed(folder: Path) -> None:
+    said = "Nothing says what is critical of these rows: dist* ≤ 0 is assumed"
+    assert said in " ".join(f.detail for f in check_scenario(ScenarioSpec(f"table:{folder}", str(folder))))
+    common = {"campaign": "coverage"}
+    assert said in " ".join(asked_again(folder, folder.parent / "a", **common).sentences())
+    stated = {"metric": "dist*", "critical": [None, 0.0]}
+    assert said not in " ".join(asked_again(folder, folder.parent / "b", requirement=stated, **common).sentences())
+    (folder / "config.yml").write_text(f"{CONFIG}requirement: {{metric: 'dist*', critical: [null, 0.1]}}\n")
+    found = asked_again(folder, folder.parent / "c", **common)
+    assert "dist* ≤ 0.1" in found.sentences()[0]
+    assert said not in " ".join(found.sentences())
+
+
+@pytest.mark.parametrize(
+    "wrong", ["[1]", "{metric: 'dist*'}", "{metric: 'dist*', critical: [1]}", "{metric: 'dist*', critical: [2, 1]}",
+              "{metric: speed, critical: [0, 1]}", "{any: []}", "{any: 3}", "{critical: [0, 1]}",
+              "{metric: 'dist*', critical: [a, b]}"],
+)  # fmt: skip
+def test_a_table_with_a_wrong_requirement_is_refused(folder: Path, wrong: str) -> None:
+    (folder / "config.yml").write_text(f"{CONFIG}requirement: {wrong}\n")
+    with pytest.raises(InputError, match=r"config\.yml.*requirement"):
+        load("scenarios", f"table:{folder}")

@@ -1,8 +1,8 @@
 """Recorded outcomes as a scenario: `table:FOLDER`, in the layout of the public DSIOD data set.
 
-The folder holds `config.yml` (inputs with type, unit, min, max and explanation; outputs with unit)
-and one table of rows, parquet or csv. A campaign on it chooses among the recorded rows instead of
-simulating, and is scored on all rows that it has not chosen.
+The folder holds `config.yml` (inputs with type, unit, min, max and explanation; outputs with unit; beyond the data set's own
+keys, `requirement` as in a configuration) and one table of rows, parquet or csv. A campaign on it chooses among the recorded
+rows instead of simulating, and is scored on all rows that it has not chosen.
 
 Source:
     Driving Scenario Input Output Dataset, Winkelmann et al. (2022), appendix of
@@ -28,6 +28,7 @@ from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.store.history import History, named_columns
+from sbt.store.stated import stated_requirement, written_requirement
 
 __all__ = ["from_folder", "to_folder"]
 
@@ -44,10 +45,11 @@ def from_folder(name: str, folder: Path) -> LogicalScenario:
         folder: where relative paths start.
 
     Returns:
-        A scenario whose requirement is the first output below 0, which a configuration replaces.
+        A scenario with the folder's requirement; where it states none, the first output is critical up to 0, and the pool's
+        notes say that this is assumed. A configuration replaces either.
 
     Raises:
-        InputError: no config.yml, no or several tables, columns missing, or values outside the ranges.
+        InputError: no config.yml, no or several tables, columns missing, values outside the ranges, or a wrong requirement.
     """
     path = (Path(folder) / name).resolve()
     table = _table_of(path)
@@ -64,10 +66,12 @@ def from_folder(name: str, folder: Path) -> LogicalScenario:
     if len(x) < 2:
         raise InputError(f"{table}: a table needs at least two complete rows, but got {len(x)}")
     space = ParameterSpace(tuple(_parameter(key, entry, x[:, k]) for k, (key, entry) in enumerate(inputs.items())))
-    pool = Pool(x, {column: rows[column][kept] for column in outputs}, notes)
+    assumed = Requirement(next(iter(outputs)), high=0.0) if described.get("requirement") is None else None
+    need = assumed or stated_requirement(described["requirement"], outputs, table.parent / "config.yml")
+    pool = Pool(x, {column: rows[column][kept] for column in outputs}, notes, assumed)
     title, text = str(described.get("title", path.name)), str(described.get("logical_scenario", ""))
     return LogicalScenario(
-        name=f"table:{name}", space=space, requirement=Requirement(next(iter(outputs)), high=0.0),
+        name=f"table:{name}", space=space, requirement=need,
         evaluate=_Lookup(space, pool), metric_names=tuple(outputs), description=f"{title} (recorded)\n{text}", pool=pool,
     )  # fmt: skip
 
@@ -134,6 +138,7 @@ def to_folder(history: History, scenario: LogicalScenario, folder: Path, suffix:
             "explanation": p.description,
         } for p in scenario.space.parameters},
         "outputs": {name: {"type": "continuous", "unit": units.get(name, "")} for name in done.metrics},
+        "requirement": written_requirement(scenario.requirement),
     }  # fmt: skip
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "config.yml").open("w", encoding="utf-8") as file:
