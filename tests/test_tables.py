@@ -15,8 +15,10 @@ from sbt.cli import app
 from sbt.config.load import parse
 from sbt.errors import InputError
 from sbt.execution.spec import ScenarioSpec
+from sbt.loop.stages import notes_of
 from sbt.plugins import Scope, load
 from sbt.problem.combination import CombinedRequirement
+from sbt.problem.scenario import LogicalScenario
 from sbt.samplers.pool import PoolSequence
 from sbt.seeds import stream
 from sbt.store.database import Store
@@ -277,3 +279,40 @@ def test_a_table_with_a_wrong_requirement_is_refused(folder: Path, wrong: str) -
     (folder / "config.yml").write_text(f"{CONFIG}requirement: {wrong}\n")
     with pytest.raises(InputError, match=r"config\.yml.*requirement"):
         load("scenarios", f"table:{folder}")
+
+
+def test_a_table_of_an_export_is_even_in_the_logarithm_where_its_campaign_was(exported: Path, tmp_path: Path) -> None:
+    """21 % of the rows are critical, and .011 % of the space that a boundary over them spoke of."""
+    rate, a = load("scenarios", f"table:{exported}").space.parameters
+    assert (rate.logarithmic, a.logarithmic) == (True, False)
+    found = asked_again(exported, tmp_path / "s", campaign="boundary", metamodel="et", stop={"stable": None})
+    assert found.conclusion.critical_fraction == pytest.approx(0.21, abs=0.05)
+    again = load("scenarios", f"table:{found.export('dsiod').parent}").space.parameters
+    assert [p.logarithmic for p in again] == [True, False]
+
+
+def foreign(table: Path, u: np.ndarray, more: str = "") -> LogicalScenario:
+    """Return the scenario of a table that nobody exported, with these values of one input."""
+    table.mkdir()
+    (table / "rows.csv").write_text("\n".join(["r,m", *(f"{x!r},{x!r}" for x in u.tolist())]) + "\n")
+    (table / "config.yml").write_text(f"inputs: {{r: {{type: continuous{more}}}}}\noutputs: {{m: {{unit: s}}}}\n")
+    return load("scenarios", f"table:{table}")
+
+
+def test_rows_over_decades_say_that_their_input_is_even_in_the_logarithm(tmp_path: Path) -> None:
+    u = (np.arange(400) + 0.5) / 400
+    even, decades = 1e-4 + u * 10.0, 1e-4 * 1e5**u
+    for name, rows, more, logarithmic, said in (
+        ("even", even, "", False, ""),
+        ("decades", decades, "", True, "r is shared out evenly in its logarithm"),
+        ("stated", decades, ", logarithmic: true", True, ""),
+        ("denied", decades, ", logarithmic: false", False, ""),
+        ("from zero", decades, ", min: 0", False, "80 % of the rows lie in the lowest tenth of the range of r"),
+    ):
+        scenario = foreign(tmp_path / name, rows, more)
+        assert scenario.space.parameters[0].logarithmic is logarithmic, name
+        notes = " ".join(notes_of(scenario))
+        assert said in notes, name
+        assert said or " r " not in notes, name
+    with pytest.raises(InputError, match=r"logarithmic.*0 < min.*hundred"):
+        foreign(tmp_path / "wrong", even, ", min: 0, logarithmic: true")

@@ -1,8 +1,8 @@
 """Recorded outcomes as a scenario: `table:FOLDER`, in the layout of the public DSIOD data set.
 
 The folder holds `config.yml` (inputs with type, unit, min, max and explanation; outputs with unit; beyond the data set's own
-keys, `requirement` as in a configuration) and one table of rows, parquet or csv. A campaign on it chooses among the recorded
-rows instead of simulating, and is scored on all rows that it has not chosen.
+keys, `requirement` as in a configuration, and `logarithmic` of an input) and one table of rows, parquet or csv. A campaign on
+it chooses among the recorded rows instead of simulating, and is scored on all rows that it has not chosen.
 
 Source:
     Driving Scenario Input Output Dataset, Winkelmann et al. (2022), appendix of
@@ -11,7 +11,9 @@ Source:
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,7 @@ from numpy.typing import NDArray
 
 from sbt.errors import InputError, RunError
 from sbt.problem.arrays import Vector
+from sbt.problem.distribution import Distribution
 from sbt.problem.outcome import Status
 from sbt.problem.parameter import Parameter
 from sbt.problem.plain import Values
@@ -65,7 +68,9 @@ def from_folder(name: str, folder: Path) -> LogicalScenario:
     x = np.column_stack([rows[column] for column in inputs])[kept]
     if len(x) < 2:
         raise InputError(f"{table}: a table needs at least two complete rows, but got {len(x)}")
-    space = ParameterSpace(tuple(_parameter(key, entry, x[:, k]) for k, (key, entry) in enumerate(inputs.items())))
+    read = [_parameter(key, entry, x[:, k]) for k, (key, entry) in enumerate(inputs.items())]
+    space = ParameterSpace(tuple(parameter for parameter, _ in read))
+    notes = (*notes, *(note for _, note in read if note))
     assumed = Requirement(next(iter(outputs)), high=0.0) if described.get("requirement") is None else None
     need = assumed or stated_requirement(described["requirement"], outputs, table.parent / "config.yml")
     pool = Pool(x, {column: rows[column][kept] for column in outputs}, notes, assumed)
@@ -135,7 +140,7 @@ def to_folder(history: History, scenario: LogicalScenario, folder: Path, suffix:
         "inputs": {p.name: {
             "type": p.kind, "unit": p.unit,
             **({"choices": _choices(p)} if p.choices else {"min": p.bounds[0], "max": p.bounds[1]}),
-            "explanation": p.description,
+            **({} if p.discrete else {"logarithmic": p.logarithmic}), "explanation": p.description,
         } for p in scenario.space.parameters},
         "outputs": {name: {"type": "continuous", "unit": units.get(name, "")} for name in done.metrics},
         "requirement": written_requirement(scenario.requirement),
@@ -213,15 +218,39 @@ def _read(path: Path, choices: Mapping[str, Iterable[str]]) -> dict[str, Any]:
     return found
 
 
-def _parameter(name: str, entry: Mapping[str, Any], column: np.ndarray) -> Parameter:
-    """Return an input; min may exceed max in the data set, and rows may lie a rounding outside."""
+def _parameter(name: str, entry: Mapping[str, Any], column: Vector) -> tuple[Parameter, str]:
+    """Return an input, and what its reader must know; min may exceed max in the data set, and rows may lie a rounding outside."""
     if _has_choices(entry):
         unit, text = str(entry.get("unit", "")), str(entry.get("explanation", ""))
-        return Parameter(name, unit=unit, description=text, choices=entry["choices"])
+        return Parameter(name, unit=unit, description=text, choices=entry["choices"]), ""
     low, high = sorted((float(entry.get("min", column.min())), float(entry.get("max", column.max()))))
     low, high = min(low, float(column.min())), max(high, float(column.max()))
     whole = str(entry.get("type", "continuous")) in ("integer", "discrete") and bool((column % 1 == 0).all())
-    return Parameter(
+    found = Parameter(
         name, low, high, str(entry.get("unit", "")), kind="integer" if whole else "continuous",
         description=str(entry.get("explanation", "")),
     )  # fmt: skip
+    return (found, "") if whole else _spread(found, entry.get("logarithmic"), column)
+
+
+def _spread(linear: Parameter, stated: object, column: Vector) -> tuple[Parameter, str]:
+    """Return an input as even in its logarithm where that is stated, or where the rows are so, and what is to be said of it.
+
+    Rows are where `Parameter.logarithmic` would be of a distribution: half of them in the lowest tenth of two decades or more.
+    """
+    name, low, high = linear.name, linear.low, linear.high
+    share = float((column <= low + 0.1 * (high - low)).mean())
+    if stated is False or (stated is None and share < 0.5):
+        return linear, ""
+    even = None
+    if low > 0.0 and math.isfinite(high / low):
+        even = replace(linear, distribution=Distribution.of("scipy", name="loguniform", a=low, b=high))
+    if stated is True and even is not None and even.logarithmic:
+        return even, ""
+    if stated is not None:
+        rule = "logarithmic must be true or false, true only with 0 < min and max at least a hundred times it"
+        raise InputError(f"input {name}: {rule}, but got {stated} with {linear.range}")
+    here = f"{100.0 * share:.0f} % of the rows lie in the lowest tenth of the range of {name}"
+    if even is not None and even.logarithmic:
+        return even, f"{here}: {name} is shared out evenly in its logarithm (logarithmic: false in config.yml undoes it)."
+    return linear, f"{here}, which is shared out evenly: shares of the parameter space are none of the rows."
