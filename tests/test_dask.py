@@ -6,6 +6,8 @@ import os
 import signal
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -22,6 +24,8 @@ from sbt.problem.outcome import Job, Status
 from sbt.seeds import run_seed
 
 distributed = pytest.importorskip("distributed", reason="dask.distributed is not installed (pip install 'sumo-sbt[dask]')")
+import psutil  # noqa: E402  dask brings it
+
 from sbt.execution.dask import DaskExecutor  # noqa: E402
 
 DEADLY = '''
@@ -172,3 +176,62 @@ def test_a_scheduler_that_does_not_answer_is_told(analytic: Path, monkeypatch: p
     monkeypatch.setattr("sbt.execution.dask._PATIENCE", 1)
     with pytest.raises(InputError, match=r"a dask scheduler with workers must answer at tcp://127\.0\.0\.1:9 in 1 s"):
         DaskExecutor(ScenarioSpec("analytic.py:SCENARIO", str(analytic.parent)), "tcp://127.0.0.1:9", 1).__enter__()
+
+
+SLOW_TO_START = '''
+import os, time
+from pathlib import Path
+from sbt.problem.parameter import Parameter
+from sbt.problem.requirement import Requirement
+from sbt.problem.scenario import LogicalScenario
+
+
+def begins():
+    """One of the workers, whoever comes first, is a while in starting, and says who it is."""
+    if os.getpid() != int(Path(__file__).with_name("driver").read_text()):
+        try:
+            with open(Path(__file__).with_name("slow"), "x") as file:
+                file.write(str(os.getpid()))
+        except FileExistsError:
+            return
+        time.sleep(600)
+
+
+begins()
+SCENARIO = LogicalScenario("slow", [Parameter("a", 0.0, 1.0)], Requirement("y", high=0.0), evaluate=lambda v, seed: {"y": v["a"]})
+'''
+
+
+def test_a_worker_that_is_lost_while_it_starts_is_not_waited_for(tmp_path: Path):
+    """The driver waited for ever, beside workers with nothing to do."""
+    (tmp_path / "driver").write_text(str(os.getpid()))
+    (tmp_path / "slow.py").write_text(SLOW_TO_START)
+    spec, found = ScenarioSpec("slow.py:SCENARIO", str(tmp_path)), []
+
+    def drive(address: str) -> None:
+        with DaskExecutor(spec, address, 1) as executor:
+            found.extend(executor.run([Job(k, {"a": 0.5}, k) for k in range(8)]))
+
+    threads = {"n_workers": 0, "threads_per_worker": 1, "memory_limit": 0, "dashboard_address": None}
+    with distributed.LocalCluster(**threads, host="tcp://127.0.0.1", silence_logs="CRITICAL") as started:
+        address = started.scheduler_address
+        options = ["--nthreads", "1", "--no-nanny", "--no-dashboard"]
+        command = [sys.executable, "-m", "distributed.cli.dask_worker", address, *options]
+        workers = [subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) for _ in range(2)]
+        try:
+            with distributed.Client(address, set_as_default=False) as client:
+                client.wait_for_workers(2, timeout=60)
+            driver = threading.Thread(target=drive, args=(address,), daemon=True)
+            driver.start()
+            while not (tmp_path / "slow").is_file() or not (slow := (tmp_path / "slow").read_text()):
+                time.sleep(0.05)
+            above = {int(slow), *(process.pid for process in psutil.Process(int(slow)).parents())}
+            lost = next(w for w in workers if w.pid in above)
+            lost.kill()
+            driver.join(60)
+            assert not driver.is_alive()
+        finally:
+            for worker in workers:
+                worker.kill()
+                worker.wait()
+    assert len(found) == 8

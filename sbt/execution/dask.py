@@ -13,6 +13,7 @@ import platform
 import tempfile
 from collections import deque
 from collections.abc import Iterator, Sequence
+from concurrent.futures import CancelledError
 from importlib.util import find_spec
 from typing import Any, Self
 
@@ -32,6 +33,8 @@ _TARGET = 0.5
 """Target duration of a chunk of runs (s): a dask task costs milliseconds."""
 _GRACE = 5
 """Longest wait for the client to close (s)."""
+_LOOK = 1.0
+"""Time after which it is looked whether a worker that starts is still there (s)."""
 _PATIENCE = 60
 """Longest wait for the scheduler and its first worker (s)."""
 _LARGE = 100_000
@@ -126,18 +129,29 @@ class DaskExecutor:
             fire_and_forget(self._client.submit(_end, self._spec, self._limits, workers=[worker], pure=False))
 
     def _prepare(self) -> None:
-        """Start the processes below all workers at the same time."""
-        from distributed import KilledWorker
-
+        """Start the processes below all workers at the same time; do not wait for one that leaves meanwhile."""
         own = _versions(self._spec)
         found = {w: self._client.submit(_begin, self._spec, self._limits, workers=[w], pure=False) for w in self._workers()}
         for worker, future in found.items():
-            try:
-                of_worker = self._result(future)
-            except KilledWorker:  # it has left since
-                continue
-            if of_worker != own:
+            of_worker = self._begun(worker, future)
+            if of_worker not in (None, own):
                 raise InputError(f"every worker must have the versions of this process ({own}), but {worker} has {of_worker}")
+
+    def _begun(self, worker: str, future: Any) -> str | None:
+        """Return the versions of a worker whose process is started; None: it has left since."""
+        from distributed import KilledWorker
+
+        while True:
+            try:
+                return str(self._result(future, _LOOK))
+            except KilledWorker:
+                return None
+            except TimeoutError:
+                if future.done():
+                    raise
+            if worker not in self._workers():  # dask keeps what only this worker may do, until one comes at its address
+                future.cancel()
+                return None
 
     def _workers(self) -> list[str]:
         """Return the addresses of the present workers."""
@@ -190,11 +204,9 @@ class DaskExecutor:
             yield outcomes
         return suspects
 
-    def _result(self, future: Any) -> Any:
-        from concurrent.futures import CancelledError
-
+    def _result(self, future: Any, patience: float | None = None) -> Any:
         try:
-            return future.result()
+            return future.result(patience)
         except CancelledError as error:
             raise self._lost() from error
 
