@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -235,3 +236,29 @@ def test_a_worker_that_is_lost_while_it_starts_is_not_waited_for(tmp_path: Path)
                 worker.kill()
                 worker.wait()
     assert len(found) == 8
+
+
+def test_an_interruption_while_the_scheduler_is_looked_for_ends_at_once(tmp_path: Path):
+    """It took two minutes more, and ended with a traceback of dask."""
+    silent = socket.create_server(("127.0.0.1", 0))  # answers nothing, as a port that is forwarded to nowhere
+    for port in (silent.getsockname()[1], 9):
+        code = f"""
+from sbt.execution.dask import DaskExecutor
+from sbt.execution.spec import ScenarioSpec
+print("looking", flush=True)
+DaskExecutor(ScenarioSpec("cut_in"), "tcp://127.0.0.1:{port}", 1).__enter__()
+"""
+        with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as looking:
+            assert looking.stdout is not None
+            assert looking.stdout.readline() == "looking\n"
+            time.sleep(4.0)
+            looking.send_signal(signal.SIGINT)
+            begun = time.monotonic()
+            try:
+                _, said = looking.communicate(timeout=30)
+            finally:
+                looking.kill()
+        assert time.monotonic() - begun < 15
+        assert said.strip().endswith("KeyboardInterrupt")
+        assert "Exception ignored" not in said
+    silent.close()

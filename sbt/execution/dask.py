@@ -11,9 +11,10 @@ from __future__ import annotations
 import multiprocessing
 import platform
 import tempfile
+import threading
 from collections import deque
 from collections.abc import Iterator, Sequence
-from concurrent.futures import CancelledError
+from concurrent.futures import CancelledError, Future
 from importlib.util import find_spec
 from typing import Any, Self
 
@@ -77,14 +78,12 @@ class DaskExecutor:
 
     def __enter__(self) -> Self:
         """Connect, check the workers, and let them load the scenario."""
-        from distributed import Client
-
         open_missing()
         try:
             if self._address is None:
                 self._scratch = scratch("dask")
                 self._cluster = start_apart(self._own_cluster, abandon=lambda cluster: cluster.close())
-            self._client = Client(self._address or self._cluster, timeout=_PATIENCE, set_as_default=False)
+            self._client = self._connected()
             self._client.wait_for_workers(1, timeout=_PATIENCE)
             self._prepare()
             if len(self._spec.carried) > _LARGE:
@@ -96,6 +95,25 @@ class DaskExecutor:
             self.__exit__()
             raise
         return self
+
+    def _connected(self) -> Any:
+        """Return a client; connect in a thread, since one that is interrupted while it does takes minutes to close."""
+        from distributed import Client
+
+        found: Future[Any] = Future()
+
+        def connect() -> None:
+            try:
+                found.set_result(Client(self._address or self._cluster, timeout=_PATIENCE, set_as_default=False))
+            except BaseException as error:  # raised again where it is waited for
+                found.set_exception(error)
+
+        threading.Thread(target=connect, name="sbt-dask-connect", daemon=True).start()
+        try:
+            return found.result()
+        except BaseException:
+            found.add_done_callback(lambda late: late.exception() is not None or late.result().close(timeout=_GRACE))
+            raise
 
     def _own_cluster(self) -> Any:
         """Start workers on this machine, whose temporary folders lie in ours."""
