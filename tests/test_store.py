@@ -563,3 +563,32 @@ def test_a_path_that_sqlite_takes_no_longer_is_told_before_anything_is_made(tmp_
     (tmp_path / "link").symlink_to(beyond)
     with pytest.raises(StoreError, match=said):
         Store.open(tmp_path / "link")
+
+
+@pytest.mark.parametrize("what", ["removed", "moved", "replaced"])
+def test_a_folder_that_does_not_stay_ends_its_campaign(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str):
+    """A campaign ended well, with a conclusion and a report of rows that were gone."""
+    monkeypatch.chdir(tmp_path)
+    folder, other, calls = Path("s"), Path("other"), []
+    with Store.open(other, {"names": ["a"]}):
+        pass
+
+    def evaluate(values: dict[str, Any], seed: int) -> dict[str, float]:
+        calls.append(seed)
+        if len(calls) == 5:
+            folder.rename("away") if what != "removed" else shutil.rmtree(folder)
+            if what == "replaced":
+                shutil.copytree(other, folder)
+            os.chdir("/")
+        return {"y": values["a"]}
+
+    scenario = sbt.Scenario("leaving", [sbt.Parameter("a", 0, 1)], sbt.Requirement("y", high=0.1), evaluate=evaluate)
+    rule = r"a store must stay where it is while its campaign runs, but .*s was removed, moved or replaced"
+    with pytest.raises(StoreError, match=rule):
+        sbt.run(campaign="coverage", scenario=scenario, budget=20, executor="serial", store=folder)
+    assert len(calls) < 20
+    assert (tmp_path / "s").exists() is (what == "replaced")
+    if what != "removed":
+        with Store.read(tmp_path / "away") as store:
+            assert store.planned > 0
+            assert store.conclusion is None

@@ -30,7 +30,7 @@ from sbt.store.history import PLANNED, History, Rows, as_numbers
 from sbt.store.layout import DATABASE, OUTCOME, PLAN, SCHEMA, VERSION, checksum_of, checksums_of, damaged, refuse_damage, reported
 from sbt.store.planning import PlannedPoints, PlannedRun, dump, dump_metrics, plan_rows, storable, storable_reason
 from sbt.store.records import FitRecord, Iteration, Judgement, from_json, to_json
-from sbt.store.writer import locked, released, written
+from sbt.store.writer import Lock, locked, released, written
 
 __all__ = ["DATABASE", "PlannedPoints", "PlannedRun", "Store"]
 
@@ -54,14 +54,13 @@ class Store:
             another process, was made by another version, or is damaged.
     """
 
-    def __init__(self, folder: Path, connection: sqlite3.Connection, lock: Any = None):
+    def __init__(self, folder: Path, connection: sqlite3.Connection, lock: Lock | None = None):
         self.folder = folder
         self._db = connection
         self._lock = lock
-        self._may_hurry, self._waits = False, True  # commits need not wait for the disk, and do
-        self._waited = -_TOGETHER  # when a run last did, on the monotonic clock
+        self._may_hurry, self._waits, self._waited = False, True, -_TOGETHER  # commits may not wait, do, a run last did (clock)
         self._rows: Rows | None = None  # finished rows before the first unfinished one: they never change
-        self._read_up_to = 0  # index of the first row that is not among them
+        self._read_up_to = 0  # index of the first row not among them
         self._iterations: list[Iteration] = []
         self._fits: list[FitRecord] = []
 
@@ -82,9 +81,8 @@ class Store:
             if lock is None:
                 raise StoreError(f"a store takes one writer, but another process is writing {folder}")
             db = sqlite3.connect(folder / DATABASE, isolation_level=None)
-            mode = set_journal(db, durable=durable)
             store = cls(folder, db, lock)
-            store._may_hurry = durable and mode == "wal"
+            store._may_hurry = set_journal(db, durable=durable) == "wal" and durable
             finished = 0
             if db.execute("PRAGMA user_version").fetchone()[0] != 0:
                 store._check_version()
@@ -137,7 +135,7 @@ class Store:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close the file and release the lock."""
+        """Close it."""
         self.close()
 
     def close(self) -> None:
@@ -162,6 +160,8 @@ class Store:
     def _transaction(self, *, waits: bool = True) -> Iterator[None]:
         """Return a transaction that waits for the disk at its end, and there takes along those before that did not."""
         with reported(self.folder):
+            if self._lock is not None:
+                self._lock.must_stay()
             if self._may_hurry and waits != self._waits:
                 self._db.execute(f"PRAGMA synchronous = {'FULL' if waits else 'NORMAL'}")
                 self._waits = waits
