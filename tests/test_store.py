@@ -592,3 +592,16 @@ def test_a_folder_that_does_not_stay_ends_its_campaign(tmp_path: Path, monkeypat
         with Store.read(tmp_path / "away") as store:
             assert store.planned > 0
             assert store.conclusion is None
+
+
+def test_a_frame_has_the_columns_of_the_requirement_before_any_run_is_ok(tmp_path: Path):
+    """A script that reads `frame["y.g"]` died of it while no run had gone well yet."""
+    none = sbt.Scenario("none", [sbt.Parameter("a", 0, 1)], sbt.Requirement("g", high=0.1), evaluate=lambda values, seed: {})
+    done = sbt.run(campaign="coverage", scenario=none, budget=4, executor="serial", store=tmp_path / "s", report=False)
+    frame = done.frame[["x.a", "y.g", "critical", "margin"]]
+    assert len(frame) == 4
+    assert frame["y.g"].isna().all()
+    assert frame["y.g"].dtype == np.float64
+    either = sbt.any_of(sbt.Requirement("g", high=0.1), sbt.Requirement("h", low=3.0))
+    assert done.history.to_frame(either)[["y.g", "y.h"]].isna().all(axis=None)
+    assert list(done.history.where(np.zeros(4, dtype=bool)).to_frame(either)[["y.g", "y.h"]].dtypes) == [np.float64] * 2

@@ -334,14 +334,14 @@ class History:
                 joined by "; ".
 
         Returns:
-            Columns index, stage, iteration, x.<input> (categorical where it has choices), y.<metric>, critical, margin,
-            log_q, status, reason, seed, ...
+            Columns index, stage, iteration, x.<input> (categorical where it has choices), y.<metric>, critical, margin, ...
         """
         import pandas as pd
 
         data: dict[str, Any] = {"index": self.index, "stage": self.columns["stage"], "iteration": self.iteration}
         data |= {f"x.{name}": column for name, column in named_columns(self.x, self.names, self.choices).items()}
-        data |= {f"y.{name}": self.y(name) for name in self.metrics}
+        asked = () if requirement is None else (part.metric for part in requirement.parts)  # also while no run has them
+        data |= {f"y.{name}": self.y(name) for name in dict.fromkeys((*self.metrics, *asked))}
         if requirement is not None:
             told = requirement.told(self)  # of infinite metrics margins are infinite, too
             data["critical"] = pd.arrays.BooleanArray(requirement.critical_runs(self), np.isnan(told))
