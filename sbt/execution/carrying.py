@@ -16,15 +16,15 @@ import sys
 import sysconfig
 import threading
 import types
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from sbt.errors import InputError, described
 from sbt.problem.scenario import LogicalScenario
 
-__all__ = ["carry", "delivered", "keep_here"]
+__all__ = ["carry", "delivered", "keep_here", "packed", "unpacked"]
 
 _LOCK = threading.Lock()
 _ORIGINALS: dict[bytes, LogicalScenario] = {}
@@ -63,6 +63,25 @@ def carry(scenario: LogicalScenario) -> bytes:
             ) from None
     _ORIGINALS[data] = scenario
     return data
+
+
+def packed(objects: Mapping[tuple[str, str], Any]) -> dict[tuple[str, str], bytes]:
+    """Return objects as bytes, as `carry` does a scenario; what cannot leave the process is left out."""
+    found = {}
+    with _LOCK, _by_value():
+        for key, value in objects.items():
+            with suppress(Exception):
+                found[key] = _dumps(value)
+    return found
+
+
+def unpacked(objects: Mapping[tuple[str, str], bytes]) -> dict[tuple[str, str], Any]:
+    """Return the objects of `packed`, without those that cannot be loaded here."""
+    found = {}
+    for key, data in objects.items():
+        with suppress(Exception):
+            found[key] = _cloudpickle().loads(data)
+    return found
 
 
 def keep_here(scenario: LogicalScenario) -> bytes:

@@ -16,7 +16,7 @@ from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
 from sbt.problem.trace import Trace
 
-__all__ = ["describe_scenario", "described_choices", "is_complete", "rebuild_scenario", "scenario_differences"]
+__all__ = ["describe_scenario", "described_alone", "described_choices", "is_complete", "rebuild_scenario", "scenario_differences"]
 
 _TEXTS = ("description", "title")
 """Keys that may differ between a campaign and its resumption."""
@@ -64,6 +64,16 @@ def is_complete(data: JsonMapping) -> bool:
     """Return whether the data say all of a scenario but how it runs: no constraint or feature in Python, no recorded rows."""
     formulas = all(written for _, written in data["constraints"]) and all(text is not None for _, text in data["features"])
     return formulas and not data["recorded"]
+
+
+def described_alone(scenario: LogicalScenario) -> Json:
+    """Return a scenario as complete JSON data: without constraints and features in Python, as if it was never recorded."""
+    said = describe_scenario(scenario)
+    rules, more = said["constraints"], said["features"]
+    return {
+        **said, "constraints": [rule for rule in rules if rule[1]], "features": [each for each in more if each[1] is not None],
+        "recorded": False,
+    }  # fmt: skip
 
 
 def rebuild_scenario(data: JsonMapping) -> LogicalScenario:

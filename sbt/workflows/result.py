@@ -6,7 +6,7 @@ import base64
 import html
 import math
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -16,10 +16,12 @@ from sbt.campaigns.estimation import EstimationConclusion
 from sbt.campaigns.preventable import with_judgements
 from sbt.campaigns.wording import plural
 from sbt.errors import InputError, StoreError
+from sbt.execution.carrying import packed, unpacked
 from sbt.loop.learner import FittedMetamodel
 from sbt.loop.stages import Conclusion, Facts, sentences_of
 from sbt.metamodels.joint import in_units
 from sbt.plugins import OBJECT, Objects
+from sbt.plugins.approval import is_trusted, trust_store
 from sbt.problem.plain import Json
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.trace import Trace
@@ -45,6 +47,13 @@ __all__ = ["Film", "Page", "Result"]
 C = TypeVar("C", bound=Conclusion, covariant=True)
 
 
+def _opened(store: str, objects: Mapping[tuple[str, str], bytes], trusted: bool) -> Result[Any]:
+    """Return a result from what a pickle kept of it; code of the store that was approved there is here, too."""
+    if trusted:
+        trust_store(Path(store))
+    return Result(Path(store), unpacked(objects))
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Result(Generic[C]):
     """A campaign's store, read: as it was when the result was first asked; open it again to see more of a running one.
@@ -56,6 +65,10 @@ class Result(Generic[C]):
 
     store: Path
     objects: Objects = field(default_factory=dict)
+
+    def __reduce__(self) -> tuple[Callable[..., Result[Any]], tuple[Any, ...]]:
+        """Return what a pickle keeps: where the store is, which is read again, and of the objects those that can travel."""
+        return _opened, (str(Path(self.store).absolute()), packed(self.objects), is_trusted(self.store))
 
     @cached_property
     def _read(self) -> tuple[Study, History, Json, list[FitRecord]]:
