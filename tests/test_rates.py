@@ -16,7 +16,7 @@ from sbt.campaigns.confirming import shares
 from sbt.campaigns.failures import batches_by, search_runs
 from sbt.campaigns.modes import FailureRate
 from sbt.campaigns.rates import LocalRates, local_rates, next_repetitions
-from sbt.campaigns.records import CONFIRM, RACE
+from sbt.campaigns.records import CONFIRM, LINK, RACE
 from sbt.loop.stages import Facts, Log
 from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.problem.arrays import Points, Vector
@@ -141,8 +141,9 @@ def test_a_campaign_races_then_tells_and_each_batch_follows_from_the_log(tmp_pat
     assert modes[0].metric > min(mode.metric for mode in modes)  # the deepest is not the first
     assert int(raced.sum()) == racing == result.conclusion.raced
     assert [mode.failure_rate.runs for mode in modes] == told == [mode.confirmation_runs for mode in modes]
-    assert len(history) == len(search_runs(history)) + racing + sum(told)
-    assert history.index[raced].max() < history.index[(history.stage == CONFIRM) & ~raced].min()
+    links = np.isin(history.iteration, batches_by(log, LINK))
+    assert len(history) == len(search_runs(history)) + racing + sum(told) + links.sum()
+    assert history.index[raced].max() < history.index[(history.stage == CONFIRM) & ~raced & ~links].min()
     said = " ".join(result.conclusion.sentences(Facts(history, scenario.requirement)))
     assert "not of how deep they are" in said
     assert f"{racing} repetitions that count in no rate" in said

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from sbt.campaigns.linking import Link
-from sbt.campaigns.records import CONFIRM, LINK, SearchProposal
+from sbt.campaigns.records import CONFIRM, LINK, RACE, SearchProposal
 from sbt.loop.stages import Log
 from sbt.problem.arrays import Mask, Vector
 from sbt.store.history import History
 
-__all__ = ["Links", "batches_by", "confirmations", "links_of", "with_links"]
+__all__ = ["Links", "batches_by", "confirmations", "links_of", "raced_runs", "with_links"]
 
 Links = tuple[Link, ...]
 
@@ -36,6 +36,11 @@ def batches_by(log: Log, *methods: str) -> tuple[int, ...]:
     """Return the numbers of the batches beside the budget that are by one of these methods."""
     beside = (batch for batch in log.iterations if batch.stage == CONFIRM)
     return tuple(batch.number for batch in beside if batch.read(SearchProposal).method in methods)
+
+
+def raced_runs(log: Log) -> History:
+    """Return the repetitions that help to order the modes of a noisy simulator."""
+    return log.history.where(np.isin(log.history.iteration, batches_by(log, RACE)))
 
 
 def confirmations(history: History, x: Vector, aside: tuple[int, ...]) -> Mask:

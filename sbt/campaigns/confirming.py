@@ -72,7 +72,8 @@ class ConfirmStage:
             racing, wanted = shares(len(modes))
             left = racing - int((raced & (history.iteration > runs.iteration.max())).sum())
             if left > 0:
-                rows = next_repetitions(search.rates(runs, history.where(raced)), _distinct(runs, modes), -(-racing // ROUNDS))
+                rates = search.rates(runs, history.where(raced), links_of(log))
+                rows = next_repetitions(rates, _distinct(runs, modes), -(-racing // ROUNDS))
                 return RACE, [PlannedRun(CONFIRM, runs.inputs(row)) for row in rows[:left]]
         planned = []
         for mode, n in zip(modes, wanted, strict=True):
@@ -85,7 +86,7 @@ class ConfirmStage:
         search, searched = self.failure_search, max(batch.number for batch in log.iterations if batch.stage != CONFIRM)
         scenario, runs = search.settings.scenario, with_links(log)
         rounds, repeated = ([n for n in batches_by(log, *methods) if n > searched] for methods in ((LINK,), (RACE, _TOLD)))
-        if scenario.pool is not None or len(rounds) >= _LINK_ROUNDS or repeated or search.noisy(runs):
+        if scenario.pool is not None or len(rounds) >= _LINK_ROUNDS or repeated:
             return []
         if scenario.requirement.critical_runs(runs)[runs.ok].all():  # nothing is known to be between modes
             return []
@@ -93,7 +94,8 @@ class ConfirmStage:
         most = min(max(int(_LINK_SHARE * (len(runs) - asked)), _FEWEST_LINKS), _MOST_LINKS)
         known = {tuple(row) for row in runs.x}  # whole numbers: the way may lead through a run
         new: dict[tuple[float, ...], Way] = {}
-        for way in (way for both in itertools.zip_longest(*search.ways_to_ask(log)) for way in both if way is not None):
+        ways = search.ways_to_ask(log)
+        for way in (way for both in itertools.zip_longest(ways.doubtful, ways.unasked) for way in both if way is not None):
             new.setdefault(tuple(scenario.space.from_unit(way.at[None])[0]), way)
         return [way for row, way in new.items() if row not in known][: min(most - asked, -(-most // _LINK_BATCH))]
 

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from sbt.campaigns.beside import Links, batches_by, confirmations, links_of, with_links
+from sbt.campaigns.beside import Links, batches_by, confirmations, links_of, raced_runs, with_links
+from sbt.campaigns.between import RunsBetween
 from sbt.campaigns.crowding import crowded_inputs, crowded_words
 from sbt.campaigns.each import independence_words, violations_words
 from sbt.campaigns.explained import ExplainedVariance, explained_variance
 from sbt.campaigns.levels import ScreeningTold
 from sbt.campaigns.likeness import EarlierTold
-from sbt.campaigns.linking import LinksTold, Way, doubtful, pairs_joined, unasked, ways_between
+from sbt.campaigns.linking import LinksTold
 from sbt.campaigns.lost import none_gave_a_metric, nothing_known
-from sbt.campaigns.modes import FailureMode, Mode, critical_groups, describe, modes_of, most_often, single, violations
+from sbt.campaigns.modes import FailureMode, Mode, describe, modes_of, most_often, single, violations
 from sbt.campaigns.parts import share_among_held_out
 from sbt.campaigns.preventable import count_avoided
 from sbt.campaigns.rates import LocalRates, local_rates
@@ -25,6 +26,7 @@ from sbt.campaigns.repeats import SimulatorNoise, simulator_noise, stated_noise
 from sbt.campaigns.settings import Settings
 from sbt.campaigns.telling import tell_failures
 from sbt.campaigns.warmed import conditional_on
+from sbt.campaigns.ways import OpenWays, links_told, open_ways, runs_between
 from sbt.campaigns.wording import percent, plural
 from sbt.errors import InputError
 from sbt.estimators.binomial import upper
@@ -198,31 +200,15 @@ class FailureSearch:
         """Return the failure modes among these runs, some of them `links`; with noise `raced` repetitions help to order them."""
         return self._learned(history, raced, links).modes
 
-    def rates(self, history: History, raced: History) -> LocalRates:
+    def rates(self, history: History, raced: History, links: Links) -> LocalRates:
         """Return the failure rates at these runs of a noisy simulator, some of them critical; NaN where there is no metric."""
-        return self._learned(history, raced).rates
+        return self._learned(history, raced, links).rates
 
-    def ways_to_ask(self, log: Log) -> tuple[list[Way], list[Way]]:
-        """Return the ways between critical runs on which a run would tell whether they are of one mode; none with noise.
-
-        Their ends are indices of runs. First those in doubt, then the shortest between modes on which no run was made.
-        """
-        history, links, space = with_links(log), links_of(log), self.settings.scenario.space
-        fitted = self._learned(history, None, links).fitted
-        if fitted is None:
-            return [], []
-        chosen, kind = critical_groups(history, self.settings.scenario)
-        runs = history.index[chosen].tolist()
-        ways = [
-            replace(way, ends=(min(ends), max(ends)))
-            for way in ways_between(
-                fitted, space.to_unit(history.x[chosen]), kind[chosen], history.stage[chosen] == CONFIRM,
-                pairs_joined(links, runs), pairs_joined(links, runs, nested=2), space.cube,
-            )
-            if space.feasible(space.from_unit(way.at[None]))[0]
-            for ends in [[runs[k] for k in way.ends]]
-        ]  # fmt: skip
-        return doubtful(ways), unasked(ways, links)
+    def ways_to_ask(self, log: Log) -> OpenWays:
+        """Return the ways between critical runs on which a run would tell whether they are of one mode."""
+        history, links = with_links(log), links_of(log)
+        learned = self._learned(history, raced_runs(log), links)
+        return open_ways(learned.fitted, history, self.settings.scenario, links, learned.between)
 
     def _learned(self, history: History, raced: History | None, links: Links = ()) -> _Learned:
         runs = tuple(history.index.tolist()), () if raced is None else tuple(raced.index.tolist()), links
@@ -248,7 +234,8 @@ class FailureSearch:
         critical = scenario.requirement.critical_runs(again)
         found = local_rates(search, u, y, history.drawn[ok], scenario.space.to_unit(again.x), critical, rng)
         rates.mean[ok], rates.std[ok] = found.mean, found.std
-        return _Learned(modes_of(fitted, history, scenario, rates=rates.mean), rates)
+        between = runs_between(fitted, history, scenario, rates)
+        return _Learned(modes_of(fitted, history, scenario, rates=rates.mean, between=between), rates, fitted, between)
 
     def noisy(self, history: History) -> bool:
         """Say whether the requirement's metric differed among runs of equal inputs: then failing is a matter of rates."""
@@ -258,7 +245,7 @@ class FailureSearch:
         """Return what was found."""
         history, aside = log.history, batches_by(log, RACE, LINK)
         searched, scenario, known = search_runs(history), self.settings.scenario, with_links(log)
-        raced = history.where(np.isin(history.iteration, batches_by(log, RACE)))
+        raced = raced_runs(log)
         margin = self.margin(searched)
         hits = np.flatnonzero(margin <= 0)
         modes = []
@@ -274,27 +261,19 @@ class FailureSearch:
             stated_noise(history, scenario), violations(scenario.requirement, searched.where(margin <= 0)),
             None if fit is None else fit.independence,
             explained_variance(self.settings, history, (history.iteration == 0) | (history.stage == VALIDATION)),
-            raced=len(raced) or None, links=self._links_told(log), critical_inputs=inputs if inputs < len(hits) else None,
-            crowded=crowded_inputs(scenario.space),
+            raced=len(raced) or None, links=links_told(log, scenario.requirement, self.ways_to_ask(log)),
+            critical_inputs=inputs if inputs < len(hits) else None, crowded=crowded_inputs(scenario.space),
         )  # fmt: skip
-
-    def _links_told(self, log: Log) -> LinksTold | None:
-        """Return what runs between critical ones told; None where there was none."""
-        asked = log.history.where(np.isin(log.history.iteration, batches_by(log, LINK)))
-        if not len(asked):
-            return None
-        critical, (doubt, open_) = int(self.settings.scenario.requirement.critical_runs(asked).sum()), self.ways_to_ask(log)
-        left = len(doubt) + sum(way.excluded for way in open_)
-        return LinksTold(len(asked), critical, left, int((~asked.ok).sum()) or None, len(open_) or None)
 
 
 @dataclass(frozen=True)
 class _Learned:
-    """What runs say: failure modes, rates of failing where the simulator is noisy, and the metamodel where it is not."""
+    """What runs say: failure modes, the metamodel, and with noise rates of failing and what is known between critical runs."""
 
     modes: list[Mode]
     rates: LocalRates
     fitted: WarpedModel | None = None
+    between: RunsBetween | None = None
 
 
 def search_runs(history: History) -> History:

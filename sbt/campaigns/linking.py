@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
+from sbt.campaigns.between import LIKELY, SURE, RunsBetween
 from sbt.campaigns.wording import plural
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.cube import CONTINUOUS, Cube
@@ -17,7 +18,7 @@ from sbt.samplers.search import WarpedModel
 from sbt.seeds import stream
 from sbt.store.records import optional
 
-__all__ = ["Link", "LinksTold", "Way", "connected", "doubtful", "pairs_joined", "unasked", "ways_between"]
+__all__ = ["Link", "LinksTold", "Way", "connected", "doubtful", "pairs_joined", "unasked", "ways_between", "ways_in_noise"]
 
 _PROBES = 9  # on the segment between two runs
 _CHUNK = 100  # segments asked for at once
@@ -27,6 +28,8 @@ _SURE = 1.0 - 1e-9  # P(critical) that tells no point of a way from the others
 _LONG = 0.2
 """Length of a way, in the unit cube, from which on a metamodel is too sure of it: a run on it tells, once."""
 _JOINED = 0.5  # least P(critical) of a way within a mode
+_SETTLED = 0.9  # how likely a way fails about as often as its ends, from which on no run is made on it
+_POINTS, _EDGE = 4, 0.25  # of a way in noise that are asked about at once; of its length at either end, where none is
 _GROUPS, _APART = 12, 24  # modes that are compared, and ways between two of them, the shortest
 _BENDS, _REACH = 128, 0.5  # points over which such a way may lead, and how far from its middle, in its length
 
@@ -73,6 +76,7 @@ class LinksTold:
         left: ways in doubt that were not asked about.
         lost: of the runs, those that gave no metric; None: all gave one.
         untested: shortest ways between modes on which no run was made: there may be fewer modes; None: there are none.
+        dividing: ways in doubt between two modes: there may be fewer; None: there are none.
     """
 
     runs: int
@@ -80,13 +84,23 @@ class LinksTold:
     left: int
     lost: int | None = optional()
     untested: int | None = optional()
+    dividing: int | None = optional()
+
+    @property
+    def may_be_fewer(self) -> bool:
+        """Whether modes may be fewer than are told."""
+        return self.untested is not None or self.dividing is not None
 
     def sentence(self) -> str:
         """Return in words what was asked, and what remains open."""
+        if self.runs == 0:
+            open_ = f"{plural(self.dividing or 0, 'way')} between modes {'is' if self.dividing == 1 else 'are'} in doubt"
+            return f"Too few runs between critical ones tell whether they are of one failure mode: {open_}."
         asked = f"{plural(self.runs, 'run')} between critical ones tested whether they are of one failure mode"
         found = f"{self.critical} {'was' if self.critical == 1 else 'were'} critical"
         found += "" if self.lost is None else f", {self.lost} gave no metric and {'tells' if self.lost == 1 else 'tell'} nothing"
         still = f"; {plural(self.left, 'way')} between them {'is' if self.left == 1 else 'are'} still in doubt"
+        still += "" if self.dividing is None else f", {self.dividing} of them between two modes"
         return f"{asked}: {found}{still if self.left else ''}."
 
 
@@ -110,13 +124,14 @@ def pairs_joined(links: Sequence[Link], runs: Sequence[int], *, nested: int = 1)
 
 def connected(
     fitted: WarpedModel, u: Points, kind: Vector, *, noisy: bool = False, tested: Pairs = (), sure: Pairs = (),
-    cube: Cube = CONTINUOUS,
+    cube: Cube = CONTINUOUS, between: RunsBetween | None = None,
 ) -> NDArray[np.int64]:  # fmt: skip
     """Return (n,) group numbers: single linkage over segments on which P(critical) > 0.5 at 9 probes; equal inputs are one.
 
     With a noisy simulator P(critical) is small even where runs fail most: there it must exceed half of the smaller P at the two
-    ends. Of two runs that a run between critical ones has joined it is enough that the metamodel does not exclude it, whatever
-    it says where another one between these was critical too.
+    ends, and runs between them must not deny it, for much noise leaves P alike all over. Of two runs that a run between critical
+    ones has joined it is enough that the metamodel does not exclude it, whatever it says where another one between these was
+    critical too.
 
     Args:
         fitted: of the metamodel.
@@ -126,8 +141,9 @@ def connected(
         tested: of `pairs_joined`.
         sure: those of them that are nested twice.
         cube: in which u is. There is nothing between choices: a way begins with those of its end.
+        between: with noise, what runs tell of the ways; None: they are not asked.
     """
-    return _linked(fitted, u, kind, cube, noisy=noisy, tested=tested, sure=sure)[0]
+    return _linked(fitted, u, kind, cube, noisy=noisy, tested=tested, sure=sure, between=between)[0]
 
 
 def ways_between(
@@ -157,6 +173,52 @@ def ways_between(
     straight = [Way(ends[k], float(p[k].min()), probes[k, i], bool(untested[k])) for k, i in enumerate(at)]
     tree = _tree(apart, group)
     return [*straight, *(Way((i, j), *_bent(fitted, u[i], u[j], cube), (i, j) in tree) for i, j in apart)]
+
+
+def ways_in_noise(
+    fitted: WarpedModel, u: Points, kind: Vector, between: RunsBetween, made: Mapping[frozenset[int], int],
+    cube: Cube = CONTINUOUS,
+) -> tuple[list[Way], int]:  # fmt: skip
+    """Return the ways of a noisy simulator on which runs would tell whether two modes are one, and how many divide them in doubt.
+
+    They are the shortest that would make all modes one, in turn, whatever the metamodel says there, then those that join a mode,
+    the longest first; each with several points on it.
+
+    Args:
+        fitted: as in `connected`.
+        u: as in `connected`.
+        kind: as in `connected`.
+        between: what runs tell of the ways.
+        made: how many runs there were between two of u.
+        cube: as in `connected`.
+    """
+    group, joined = _linked(fitted, u, kind, cube, noisy=True, between=between)
+    p, distance = fitted.probability(u), cdist(u, u)
+    parts = np.arange(len(u), dtype=np.int64)
+    found = list[tuple[int, int, float]]()
+    for i, j in joined:
+        if distance[i, j] > _LONG:
+            least = _JOINED * float(min(p[i], p[j]))
+            found.append((i, j, between.likely(i, j, (parts == parts[i], parts == parts[j]), least)))
+        parts[parts == parts[j]] = parts[i]
+    found.sort(key=lambda way: -float(distance[way[0], way[1]]))
+    apart = sorted(_between_groups(group, kind, distance), key=lambda pair: float(distance[pair]))
+    tree = [(i, j) for i, j in apart if (i, j) in _tree(apart, group)]
+    likely = [between.likely(i, j, (group == group[i], group == group[j]), 0.0) for i, j in tree]
+    dividing = [(i, j, how) for (i, j), how in zip(tree, likely, strict=True) if how > SURE]
+    asked = [*dividing, *((i, j, how) for i, j, how in found if how < _SETTLED)]
+    ways = [list(_along(u, (i, j), how, made.get(frozenset((i, j)), 0), cube)) for i, j, how in asked]
+    first = [way for each in zip(*ways[: len(dividing)], strict=True) for way in each]
+    return [*first, *itertools.chain.from_iterable(ways[len(dividing) :])], len(dividing)
+
+
+def _along(u: Points, ends: tuple[int, int], likely: float, made: int, cube: Cube) -> Iterator[Way]:
+    """Yield ways over the next points on a segment, of which so many were run: in the middle, then between those before."""
+    from scipy.stats import qmc
+
+    start, end = cube.with_choices_of(u[[ends[1]]], u[[ends[0]]])[0], u[ends[1]]
+    for place in qmc.Halton(1, scramble=False).random(made + _POINTS + 1)[made + 1 :, 0]:
+        yield Way(ends, likely, start + (_EDGE + (1.0 - 2.0 * _EDGE) * place) * (end - start), untested=True)
 
 
 def _tree(ways: Sequence[tuple[int, int]], group: NDArray[np.int64]) -> set[tuple[int, int]]:
@@ -210,18 +272,28 @@ def unasked(ways: list[Way], links: Sequence[Link]) -> list[Way]:
 
 
 def _linked(
-    fitted: WarpedModel, u: Points, kind: Vector, cube: Cube, *, noisy: bool = False, tested: Pairs = (), sure: Pairs = ()
-) -> tuple[NDArray[np.int64], list[tuple[int, int]]]:
+    fitted: WarpedModel, u: Points, kind: Vector, cube: Cube, *, noisy: bool = False, tested: Pairs = (), sure: Pairs = (),
+    between: RunsBetween | None = None,
+) -> tuple[NDArray[np.int64], list[tuple[int, int]]]:  # fmt: skip
     """Return (n,) group numbers, and the pairs that join them."""
     n, pairs = len(u), list[tuple[int, int]]()
     level = _JOINED * fitted.probability(u) if noisy else np.full(n, _JOINED)
     group = np.arange(n, dtype=np.int64)
     distance = cdist(u, u)
 
+    denied = np.zeros((n, n), dtype=np.bool_)
+
     def join(i: int, j: int) -> None:
         if group[i] != group[j]:
             pairs.append((i, j))
             group[group == group[j]] = group[i]
+
+    def judged(i: int, j: int) -> None:
+        one, other = group == group[i], group == group[j]
+        if between is None or distance[i, j] == 0.0 or between.likely(i, j, (one, other), min(level[i], level[j])) >= LIKELY:
+            join(i, j)
+        else:  # the nearest way between two modes decides
+            denied[np.ix_(one, other)] = denied[np.ix_(other, one)] = True
 
     for i, j in tested:
         if kind[i] == kind[j] and ((i, j) in sure or _probed(fitted, u[[i]], u[[j]], cube)[1].min() > _DOUBT[0]):
@@ -241,7 +313,8 @@ def _linked(
         least = np.minimum(level[a], level[b])[:, None]
         inside: Mask = (_probed(fitted, u[a], u[b], cube)[1] > least).all(axis=1) | (distance[a, b] == 0.0)
         for i, j in zip(a[inside].tolist(), b[inside].tolist(), strict=True):
-            join(i, j)
+            if group[i] != group[j] and not denied[i, j]:
+                judged(i, j)
     return group, pairs
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
+from sbt.campaigns.between import RunsBetween
 from sbt.campaigns.linking import Link, connected, pairs_joined
 from sbt.estimators.binomial import interval
 from sbt.metrics.conflict_types import METRIC_NAME as CONFLICT_TYPE
@@ -151,8 +152,9 @@ def worst_first(history: History, margins: Vector) -> NDArray[np.int64]:
 
 
 def modes_of(
-    fitted: WarpedModel, history: History, scenario: LogicalScenario, *, rates: Vector | None = None, links: Sequence[Link] = ()
-) -> list[Mode]:
+    fitted: WarpedModel, history: History, scenario: LogicalScenario, *, rates: Vector | None = None, links: Sequence[Link] = (),
+    between: RunsBetween | None = None,
+) -> list[Mode]:  # fmt: skip
     """Return the failure modes, the one with the deepest run first; of a noisy simulator the likeliest to fail again first.
 
     Repetitions that are told do not decide the order: the rate of the one that failed most often in them would be stated
@@ -164,6 +166,7 @@ def modes_of(
         scenario: with the campaign's space and requirement.
         rates: (n,) failure rates at these runs, where the simulator is noisy, see `connected` and `Mode`; None: it is not.
         links: runs among them that were made between critical ones.
+        between: with noise, what runs tell of the ways between those of `critical_groups`.
     """
     critical = scenario.requirement.critical
     y = scenario.requirement.values(history)
@@ -175,7 +178,9 @@ def modes_of(
     at = cube.embedded(u)
     depth, worse = scenario.requirement.depths(history), severity(history)
     tested, sure = (pairs_joined(links, history.index[chosen].tolist(), nested=times) for times in (1, 2))
-    group = connected(fitted, u[chosen], kind[chosen], noisy=rates is not None, tested=tested, sure=sure, cube=cube)
+    group = connected(
+        fitted, u[chosen], kind[chosen], noisy=rates is not None, tested=tested, sure=sure, cube=cube, between=between
+    )
     log_rate = np.zeros(len(history)) if rates is None else np.log(np.maximum(rates, _LEAST_RATE))
     apart = kind[hits][:, None] != kind[chosen][None, :]
     label = group[(cdist(at[hits], at[chosen]) + _FAR * apart).argmin(axis=1)]

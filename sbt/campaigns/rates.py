@@ -19,6 +19,7 @@ from sbt.samplers.search import Search
 __all__ = ["LocalRates", "local_rates", "next_repetitions"]
 
 _WIDTHS = (0.4, 0.7, 1.0)  # of the kernel, in length scales; 0.15 counts too few runs (docs/measured/falsification.md)
+_RADII = (0.05, 0.1, 0.2)  # and in diagonals of the cube: heavy noise hides all length scales
 _WEIGHTS = np.array([0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 1e9])[:, None]  # of P(critical), in runs; last: P alone
 _LEAST = 1e-4  # rates within this of 0 and 1 are not told apart
 _CHUNK = 512  # inputs whose neighbours are weighed at once
@@ -44,9 +45,9 @@ def local_rates(
     """Return the failure rate at each run, from the share of critical ones among the runs near it and its repetitions.
 
     A rate is the mean of a beta distribution: critical and uncritical runs near, weighed by a Gaussian kernel along the length
-    scales of a Gaussian process of the metric, beside the P(critical) that this process predicts from all other runs, with a
-    weight in runs. Widths and weights are averaged by the likelihood of what was critical at each input, predicted from
-    the others: where metrics tell rates, P decides, where rare failures are deep, counts do. The first critical run at the
+    scales of a Gaussian process of the metric, or in the cube, beside the P(critical) that this process predicts from all other
+    runs, with a weight in runs. Widths and weights are averaged by the likelihood of what was critical at each input, predicted
+    from the others: where metrics tell rates, P decides, where rare failures are deep, counts do. The first critical run at the
     inputs is left out of its own rate, for it was chosen by its result.
 
     Args:
@@ -71,8 +72,9 @@ def local_rates(
     searched = np.bincount(own, counted & critical, len(first))
     hits = searched + np.bincount(group[len(u) :], critical_again, len(first))
     runs = np.bincount(own, counted, len(first)) + np.bincount(group[len(u) :], minlength=len(first))
-    at = search.columns(every[first]) / lengthscale
-    near = _near(at, np.stack([hits, runs], axis=1))  # (widths, groups, 2)
+    at, cube = search.columns(every[first]) / lengthscale, search.cube.embedded(every[first]) / np.sqrt(u.shape[1])
+    counts = np.stack([hits, runs], axis=1)
+    near = np.concatenate([_near(at, counts, _WIDTHS), _near(cube, counts, _RADII)])  # (widths, groups, 2)
     near_hits, near_runs = near[:, None, :, 0] + _WEIGHTS * prior, near[:, None, :, 1] + _WEIGHTS  # (widths, weights, groups)
     expected = np.clip(near_hits / near_runs, _LEAST, 1.0 - _LEAST)
     likelihood = (xlogy(hits, expected) + xlogy(runs - hits, 1.0 - expected)).sum(axis=2)
@@ -124,13 +126,13 @@ def _left_out(search: Search, u: Points, y: Vector, inputs: Points, rng: np.rand
     return np.exp(log_probability), fitted.hyper.roughness**-0.5
 
 
-def _near(at: Points, counts: Points) -> NDArray[np.float64]:
+def _near(at: Points, counts: Points, widths: Sequence[float]) -> NDArray[np.float64]:
     """Return (widths, g, c) sums of counts (g, c) at all other points than each, weighed by their distance from at (g, d)."""
-    found = np.empty((len(_WIDTHS), *counts.shape))
+    found = np.empty((len(widths), *counts.shape))
     for start in range(0, len(at), _CHUNK):
         part = slice(start, start + _CHUNK)
         squares = cdist(at[part], at, "sqeuclidean")
         squares[np.arange(len(squares)), np.arange(len(squares)) + start] = np.inf
-        for k, width in enumerate(_WIDTHS):
+        for k, width in enumerate(widths):
             found[k, part] = np.exp(-0.5 * squares / width**2) @ counts
     return found

@@ -175,7 +175,7 @@ def tell_failures(found: FalsificationConclusion, random: CriticalShare, facts: 
         again = repetitions(round((often.confirmed or 0.0) * n), n, lost)
         worst += f"; run {often.representative} came back more often, in {again}"
     searched = int((facts.history.stage != CONFIRM).sum())
-    fewer = single(modes, facts.history) > 1 or (found.links is not None and found.links.untested is not None)
+    fewer = single(modes, facts.history) > 1 or (found.links is not None and found.links.may_be_fewer)
     most = "up to " if fewer else ""
     between = ", with critical runs that were met on the way between them" if len(modes) > found.critical_runs else ""
     inputs = found.critical_inputs
