@@ -178,3 +178,20 @@ def test_runs_that_one_between_them_has_joined_are_of_one_mode_unless_the_metamo
     assert connected(fitted, u[:3], np.zeros(3), tested=[(0, 1)]).tolist() == groups
     assert connected(fitted, u[:3], np.arange(3.0), tested=[(0, 1)]).tolist() == [0, 1, 2]  # other conflict types
     assert connected(fitted, u[:3], np.zeros(3), tested=[(0, 1)], sure=[(0, 1)]).tolist() == [0, 0, 2]
+
+
+def test_modes_between_which_ways_are_in_doubt_are_up_to_so_many(tmp_path: Path):
+    """One bent sheet of three inputs: all runs between critical ones are spent before a way between two modes was asked about."""
+
+    def evaluate(values: dict, _: int) -> dict:
+        return {"y": 10.0 * values["a"] + 5.0 * float(np.sin(3.0 * values["b"])) - 3.0 * values["c"]}
+
+    inputs = [sbt.Parameter(name, 0.0, 1.0) for name in "abc"]
+    scenario = sbt.Scenario("f_mid", inputs, sbt.Requirement("y", low=12.5, high=12.6), evaluate=evaluate, metrics=["y"])
+    keys = {"campaign": "falsification", "executor": "serial", "report": False, "judges": []}
+    result = sbt.run(scenario=scenario, budget=150, seed=0, store=tmp_path / "s", **keys)
+    links, said = result.conclusion.links, result.sentences()
+    assert len(result.conclusion.failure_modes) == 2
+    assert (links.untested, links.dividing) == (None, 1)
+    assert "in up to 2 distinct failure modes" in said[0]
+    assert f"; {links.left} ways between them are still in doubt, 1 of them between two modes." in " ".join(said)

@@ -9,7 +9,7 @@ import numpy as np
 
 from sbt.campaigns.beside import Links, batches_by
 from sbt.campaigns.between import RunsBetween
-from sbt.campaigns.linking import LinksTold, Way, doubtful, pairs_joined, unasked, ways_between, ways_in_noise
+from sbt.campaigns.linking import LinksTold, Way, connected, doubtful, pairs_joined, unasked, ways_between, ways_in_noise
 from sbt.campaigns.modes import critical_groups
 from sbt.campaigns.rates import LocalRates
 from sbt.campaigns.records import CONFIRM, LINK
@@ -76,8 +76,9 @@ def open_ways(
         return OpenWays(told(ways), [], dividing)
     tested, sure = (pairs_joined(links, runs, nested=times) for times in (1, 2))
     ways = ways_between(fitted, u, kind, history.stage[chosen] == CONFIRM, tested, sure, space.cube)
+    group = connected(fitted, u, kind, tested=tested, sure=sure, cube=space.cube)
     doubt = doubtful(ways)
-    return OpenWays(told(doubt), unasked(told(ways), links))
+    return OpenWays(told(doubt), unasked(told(ways), links), sum(group[way.ends[0]] != group[way.ends[1]] for way in doubt))
 
 
 def links_told(log: Log, requirement: Requirement, ways: OpenWays) -> LinksTold | None:
