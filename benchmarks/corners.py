@@ -2,19 +2,20 @@
 
     python benchmarks/corners.py ties [--seeds 300]
     python benchmarks/corners.py many [--seeds 300]
+    python benchmarks/corners.py repeats [--seeds 1500]
     python benchmarks/corners.py batches [--seeds 16]
     python benchmarks/corners.py chance [--seeds 30]
     python benchmarks/corners.py waves [--seeds 12]
     python benchmarks/corners.py sometimes [--seeds 60]
     python benchmarks/corners.py idle [--seeds 12]
 
-`ties` repeats one subset simulation of 200 points a level on a plane in two and ten normal inputs whose margin is rounded or cut
-off. `many` is what campaigns with many inputs do where no few directions explain the metric, without the store: the choice
-between crude Monte Carlo and subset simulation, and both. `batches` runs campaigns on P(x >= 2) of a normal x beside a second
-input that moves the edge, or makes the metric jump. `chance` has a smooth region of P = .001, and a sixth of the space where one
-seed in ten fails, which no metric shows, with a gate of .012; `waves` a deterministic metric with seven periods along an input.
-`sometimes` are falsifications of 100 runs where the conflict arises with some seeds only; `idle` such of wells beside choices
-that change nothing.
+`ties` repeats one subset simulation of 200 points a level on a plane in two and ten normal inputs whose margin is rounded or
+cut off. `many` is what campaigns with many inputs do where no few directions explain the metric, without the store: the
+choice between crude Monte Carlo and subset simulation, and both. `repeats` are the limits of subset simulation alone.
+`batches` runs campaigns on P(x >= 2) of a normal x beside a second input that moves the edge, or makes the metric jump.
+`chance` has a smooth region of P = .001, and a sixth of the space where one seed in ten fails, which no metric shows, with a
+gate of .012; `waves` a deterministic metric with seven periods along an input. `sometimes` are falsifications of 100 runs
+where the conflict arises with some seeds only; `idle` such of wells beside choices that change nothing.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from sbt.campaigns.gate import Limits
 from sbt.campaigns.many_inputs import halves_that_count
 from sbt.campaigns.repeated import limits_by_repeats
 from sbt.estimators.monte_carlo import Proportion
-from sbt.estimators.subset import SubsetRun, combine_repeats, next_levels
+from sbt.estimators.subset import RepeatedEstimate, SubsetRun, combine_repeats, next_levels
 from sbt.seeds import stream
 
 MARGINS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
@@ -50,6 +51,12 @@ METRICS: dict[str, tuple[Callable[[float, float], float], float]] = {
     "inf where y < .1 and beyond 1.5": (lambda x, y: 2.0 - x if y >= 0.1 and x > 0.5 else np.inf, 0.9 * float(ndtr(-2.0))),
     "5 where y < .1": (lambda x, y: 2.0 - x if y >= 0.1 else 5.0, 0.9 * float(ndtr(-2.0))),
 }
+SHAPES = ("sphere", "plane", "two planes")
+LIMITS: tuple[tuple, ...] = (
+    *((0.001, 20, budget) for budget in (400, 600, 1000, 2000, 4000)), (0.01, 20, 400), (0.01, 20, 2000), (1e-5, 20, 4000),
+    (0.001, 50, 600), (0.001, 50, 2000), (2e-4, 30, 2000, "plane"), (2e-4, 80, 2000, "plane"),
+)  # fmt: skip
+"""P, inputs, runs, and of which shapes; all, if of none."""
 SIZES = ((300, 150), (300, 75), (150, 75))
 
 
@@ -99,7 +106,7 @@ def _campaign(margin, d: int, budget: int, rng: np.random.Generator) -> tuple[fl
     if found.value == 0.0:
         return share.value, Limits(share.lower, share.upper), False
     limits = limits_by_repeats(found, share)
-    reached = all(r.finished for r in repeats) or all(r.estimate > 0.0 for r in repeats)
+    reached = found.tells_spread and (all(r.finished for r in repeats) or all(r.estimate > 0.0 for r in repeats))
     return found.value, limits if reached else Limits(limits.lower, share.upper), False
 
 
@@ -125,6 +132,49 @@ def many(seeds: int) -> None:
                     f"{np.median([0.5 * (high - low) / p for low, high in ends]):.2f} |",
                     flush=True,
                 )  # fmt: skip
+
+
+def _of_shape(shape: str, d: int, p: float) -> Callable[[np.ndarray], np.ndarray]:
+    """Return a margin in d normal inputs, negative with probability p: outside of a sphere, beyond a plane or one of two."""
+    if shape == "sphere":
+        edge = chi2(d).isf(p)
+        return lambda z: edge - (z**2).sum(axis=1)
+    if shape == "plane":
+        edge = norm.isf(p)
+        return lambda z: edge - z.sum(axis=1) / np.sqrt(d)
+    edge, half = norm.isf(1.0 - np.sqrt(1.0 - p)), d // 2
+    return lambda z: edge - np.maximum(z[:, :half].sum(axis=1), z[:, half:].sum(axis=1)) / np.sqrt(half)
+
+
+def repeats_alone(p: float, d: int, budget: int, shape: str, seed: int) -> tuple[RepeatedEstimate, Proportion, bool]:
+    """Return what subset simulation in all of the budget says, its first level, and whether its limits count."""
+    repeats, _, hits = _by_repeats(_of_shape(shape, d, p), d, budget, stream(seed, "corners", "repeats", shape, d, budget))
+    found, first = combine_repeats([r.estimate for r in repeats]), Proportion(5 * repeats[0].n, hits)
+    return found, first, found.tells_spread and (all(r.finished for r in repeats) or all(r.estimate > 0.0 for r in repeats))
+
+
+def _ends(found: RepeatedEstimate, first: Proportion, told: bool) -> tuple[float, float, float, float]:
+    """Return the ends of the two-sided 95 % interval, then one-sided 95 % limits."""
+    limits = limits_by_repeats(found, first) if found.value else Limits(first.lower, first.upper)
+    if found.value and not told:
+        limits = limits.reaching(lambda c: max(first.upper(c), found.value))
+    return limits.lower(0.975), limits.upper(0.975), limits.lower(0.95), limits.upper(0.95)
+
+
+def repeats(seeds: int) -> None:
+    print("| problem | P | runs | mean / P (std. error) | covered | above, below P (.05 each) | interval / P (median) |")
+    print("|---|---|---|---|---|---|---|")
+    for p, d, budget, *shapes in LIMITS:
+        for shape in shapes or SHAPES:
+            found = [repeats_alone(p, d, budget, shape, seed) for seed in range(seeds)]
+            low, high, least, most = np.array([_ends(*each) for each in found]).T / p
+            value = np.array([each[0].value for each in found]) / p
+            print(
+                f"| {shape} {d} | {p:g} | {budget} | {value.mean():.2f} ({value.std() / np.sqrt(seeds):.2f}) | "
+                f"{np.mean((low <= 1.0) & (high >= 1.0)):.3f} | {np.mean(least > 1.0):.3f}, {np.mean(most < 1.0):.3f} | "
+                f"{np.median(low):.2f} to {np.median(high):.2f} |",
+                flush=True,
+            )
 
 
 def batches(seeds: int) -> None:
@@ -259,7 +309,10 @@ def idle(seeds: int) -> None:
         print(f"| {choices or 'none'} | 2 | {told} | {met} |", flush=True)
 
 
-CORNERS = {"many": many, "ties": ties, "batches": batches, "chance": chance, "waves": waves, "sometimes": sometimes, "idle": idle}
+CORNERS = {
+    "many": many, "ties": ties, "repeats": repeats, "batches": batches, "chance": chance, "waves": waves, "sometimes": sometimes,
+    "idle": idle,
+}  # fmt: skip
 
 
 def main() -> None:

@@ -195,12 +195,12 @@ def _of_twenty(p: float, *, flag: bool = False) -> sbt.Scenario:
     return sbt.Scenario("sphere", inputs, sbt.Requirement("m", high=0.0), evaluate=evaluate, metrics=["m"])
 
 
-def _campaigns(scenario: sbt.Scenario, folder: Path, seeds: int, budget: int) -> list[Any]:
+def _campaigns(scenario: sbt.Scenario, folder: Path, seeds: int | range, budget: int, **keys: Any) -> list[Any]:
     return [
         sbt.run(
             campaign="estimation", scenario=scenario, seed=seed, budget=budget, executor="serial", report=False,
-            store=str(folder / f"{seed}"),
-        ) for seed in range(seeds)
+            store=str(folder / f"{seed}"), **keys,
+        ) for seed in (range(seeds) if isinstance(seeds, int) else seeds)
     ]  # fmt: skip
 
 
@@ -261,6 +261,14 @@ def test_subset_simulation_says_when_it_was_too_short(tmp_path):
     assert found["probability"] is None
     assert found["high"] > truth("linear_d10").probability
     assert "larger budget" in found["warnings"][0]
+
+
+def test_of_one_repeat_that_met_something_the_spread_is_not_known(tmp_path):
+    """Twenty points a level, of which two go on. Its upper end was at .0024, whatever the other four had not met."""
+    (found,) = _campaigns(_of_twenty(0.001), tmp_path, range(14, 15), 400, acquisition={"kind": "subset"})
+    assert found.conclusion.probability > 0.0
+    assert found.conclusion.high == pytest.approx(1.0 - 0.025 ** (1.0 / 100))
+    assert any("100 random draws set the upper end" in said for said in found.conclusion.warnings)
 
 
 def test_it_refuses_runs_of_unknown_density(campaign: Run, configured: Callable[..., Path]):

@@ -436,6 +436,31 @@ def test_levels_that_other_repeats_set_leave_no_bias(margin, p):
     assert np.mean([g.limit(0.975, side=-1) <= p <= g.limit(0.975, side=1) for g in groups]) >= 0.9
 
 
+def test_upper_limits_of_few_chains_hold():
+    """150 points of five repeats a level (budget 600): 13 of 100 ended below P, of 5 allowed."""
+    p = 1e-3
+
+    def margin(z):
+        return chi2(20).isf(p) - (z**2).sum(axis=1)
+
+    found = [combine_repeats([r.estimate for r in _repeats(30, margin, seed, most=600)]) for seed in range(300)]
+    assert np.mean([each.limit(0.95, side=1) < p for each in found]) <= 0.075
+    assert np.mean([each.limit(0.95, side=-1) > p for each in found]) <= 0.05
+
+
+def test_limits_of_repeats():
+    """The cube root of a mean of normal cube roots: by 10^7 draws of their mean and variance."""
+    found = combine_repeats([1e-3, 2e-3, 1.5e-3, 0.8e-3, 1.2e-3])
+    for confidence, limit in ((0.6, 1.3865e-3), (0.9, 1.7266e-3), (0.99, 2.645e-3), (0.999, 5.10e-3)):
+        assert found.limit(confidence, side=1) == pytest.approx(limit, rel=3e-3)
+    same, alone, wide = (combine_repeats(v) for v in ([0.2, 0.2], [0.0, 0.0, 0.0, 0.0, 0.5], [0.0, 1.0]))
+    assert (same.limit(0.95, side=-1), same.limit(0.95, side=1)) == pytest.approx((0.2, 0.2))
+    assert same.tells_spread
+    assert not alone.tells_spread
+    assert wide.limit(0.95, side=1) == 1.0
+    assert alone.limit(0.51, side=1) >= alone.value
+
+
 def test_repeats_that_the_budget_cuts_off_state_their_last_full_levels():
     """A tenth of the fourth level is critical; the budget is that of three, or of two where one took longer."""
     p = 2e-4

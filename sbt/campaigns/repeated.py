@@ -56,7 +56,8 @@ def told_by_repeats(log: Log, settings: Settings, confidence: float) -> tuple[fl
             )
         limits = Limits(lambda _: 0.0, first.upper)
         return None if cut else 0.0, limits, rest | {"exact_bound": limits.upper(confidence), "warnings": (said,)}
-    failed, reached = bool((~log.history.ok).any()), not cut or all(r.estimate > 0.0 for r in repeats)
+    failed = bool((~log.history.ok).any())
+    reached = found.tells_spread and (not cut or all(r.estimate > 0.0 for r in repeats))
     plain = None if settings.scenario.space.constraints else first
     limits = limits_by_repeats(found, plain)
     if failed or not reached:
@@ -65,6 +66,11 @@ def told_by_repeats(log: Log, settings: Settings, confidence: float) -> tuple[fl
     if cut:
         warnings.append(
             f"the budget cut off {cut} of {len(repeats)} repeats of subset simulation: what their last full levels hold is stated"
+        )
+    if not found.tells_spread:
+        warnings.append(
+            f"only one of {len(repeats)} repeats of subset simulation met anything critical, and their spread is not known:"
+            f" {first.n:,} random draws set the upper end; give a larger budget"
         )
     return found.value, limits, rest | {
         "cov": found.std_error / found.value, "hits": int(sum(r.hits for r in repeats)), "warnings": tuple(warnings),

@@ -15,9 +15,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 
 import numpy as np
-from scipy.special import stdtrit
+from scipy.optimize import brentq
+from scipy.special import chdtri, ndtr, stdtrit
 
 from sbt.problem.arrays import Points, Vector
 
@@ -30,7 +32,8 @@ _SPREADS = 0.05, 1.0  # of a step of the chains; 1: independent of where the cha
 
 
 _MOST = 0.5  # of the points, what a first level may keep
-_FARTHEST = 700.0  # exponent of a limit: beyond 1 in any case
+_LEVELS = (np.arange(512) + 0.5) / 512  # roots of levels of the variance of repeats: close where it is large
+_SAME, _NEAR = 1e-9, 1e-12  # spread of equal repeats over their mean; precision of the cube root of a limit
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,21 +153,65 @@ def _levels(margin: Vector) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class RepeatedEstimate:
-    """Mean of independent repeats with the t interval of their standard error."""
+    """Mean of independent repeats with an interval by their spread: downwards that of t, upwards that of their cube roots.
+
+    The values are skewed, so that a low mean comes with a low spread: a t interval of logarithms ends below the truth two to
+    three times as often as it may. Cube roots are nearly normal, and take values of 0.
+
+    Args:
+        value, std_error: mean of the repeats and its standard error.
+        repeats: how many there are.
+        root, root_spread: mean and standard deviation of their cube roots.
+        met: repeats that are not 0.
+
+    Source:
+        Krishnamoorthy, Mathew, Mukherjee (2008), doi 10.1198/004017007000000353: cube roots of skewed values taken for normal.
+        Weerahandi (1993), doi 10.1080/01621459.1993.10476355: the generalised limit of a function of mean and variance, here of
+        the third moment.
+    """
 
     value: float
     std_error: float
     repeats: int
+    root: float
+    root_spread: float
+    met: int
+
+    @property
+    def tells_spread(self) -> bool:
+        """Whether two repeats at least are not 0: of one the spread is not known."""
+        return self.met > 1
 
     def limit(self, confidence: float, *, side: float) -> float:
-        """Return the one-sided limit, side -1 or +1, within [0, 1]: above in logarithms, as such estimates are skewed."""
-        reach = float(stdtrit(self.repeats - 1, confidence)) * self.std_error
-        if side > 0 and self.value > 0.0:
-            return min(self.value * math.exp(min(reach / self.value, _FARTHEST)), 1.0)
-        return min(max(self.value + side * reach, 0.0), 1.0)
+        """Return the one-sided limit, side -1 or +1, within [0, 1]."""
+        if side < 0:
+            return max(self.value - float(stdtrit(self.repeats - 1, confidence)) * self.std_error, 0.0)
+        low = min(self.value, 1.0) ** (1.0 / 3.0)
+        if self.root_spread <= _SAME * self.root or self._sure(low) >= confidence:
+            return min(self.value, 1.0)
+        if self._sure(1.0) <= confidence:
+            return 1.0
+        return float(brentq(lambda root: self._sure(root) - confidence, low, 1.0, xtol=_NEAR)) ** 3
+
+    def _sure(self, root: float) -> float:
+        """Return the confidence with which the cube root of the mean is at most this one: exact where cube roots are normal.
+
+        Given their standard deviation s, that of an interval for their mean m, as the mean of cubes m^3 + 3 m s^2 grows with m.
+        """
+        s = self.root_spread * _over_spread(self.repeats - 1)
+        m = 2.0 * s * np.sinh(np.arcsinh(0.5 * (root / s) ** 3) / 3.0)
+        return float(np.average(ndtr(math.sqrt(self.repeats) * (m - self.root) / s), weights=_LEVELS))
+
+
+@cache
+def _over_spread(freedom: int) -> Vector:
+    """Return what a true standard deviation may be over that of a sample, at even roots of levels."""
+    return np.asarray(np.sqrt(freedom / chdtri(freedom, 1.0 - _LEVELS**2)))
 
 
 def combine_repeats(values: Sequence[float]) -> RepeatedEstimate:
     """Return the mean of at least two independent estimates with its standard error."""
     v = np.asarray(values, dtype=np.float64)
-    return RepeatedEstimate(float(v.mean()), float(v.std(ddof=1)) / math.sqrt(len(v)), len(v))
+    root = np.cbrt(v)
+    spread = float(v.std(ddof=1)) / math.sqrt(len(v))
+    return RepeatedEstimate(float(v.mean()), spread, len(v), float(root.mean()), float(root.std(ddof=1)), int((v > 0.0).sum()))
