@@ -63,10 +63,27 @@ class Linear:
         return {f"w{k}": float(v) for k, v in enumerate(np.exp(3.0 * w) if self.told == "exponential" else w)}
 
 
-PROBLEMS = {
+@dataclass(frozen=True)
+class Flag:
+    """Critical: half of the pairs with x > .2 and w0 < .1, and one in a hundred of all; w: three uniform numbers, told."""
+
+    p: float = 1.0 - 0.98 * 0.99
+
+    def __call__(self, values: dict[str, float], seed: int) -> dict[str, float]:
+        """Return the metric."""
+        rng = np.random.default_rng(seed)
+        w, e = rng.random(3), rng.random(2)
+        return {"y": -1.0 if (values["x"] > 0.2 and w[0] < 0.1 and e[0] < 0.5) or e[1] < 0.01 else 1.0}
+
+    def known_before(self, values: dict[str, float], seed: int) -> dict[str, float]:
+        """Return the covariates."""
+        return {f"w{k}": float(v) for k, v in enumerate(np.random.default_rng(seed).random(3))}
+
+
+PROBLEMS: dict[str, Linear | Flag] = {
     "plain": Linear(0.02), "skewed": Linear(0.02, told="exponential"), "many": Linear(0.01, drawn=12),
     "capped": Linear(0.02, cap=1.0), "useless": Linear(0.02, told="useless"), "rare": Linear(0.0015, a=0.2, c=0.1, drawn=1),
-    "rare, skewed": Linear(0.0015, a=0.2, c=0.1, drawn=1, told="exponential"),
+    "rare, skewed": Linear(0.0015, a=0.2, c=0.1, drawn=1, told="exponential"), "flag": Flag(),
 }  # fmt: skip
 
 
