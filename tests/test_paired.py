@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 
 from sbt.cli import app
 from sbt.seeds import stream
+from sbt.store.database import Store
 from sbt.workflows.paired import Pairs
 
 
@@ -122,6 +123,64 @@ def test_a_rare_comparison_says_what_it_rests_on():
     assert "10 % is not reached: more --runs" in before
     assert "reached" not in after
     assert conditional.strip() == "conditional on the traffic of 4 warm-ups"
+
+
+def _estimate(p: float, low: float, high: float, **rest: object) -> dict:
+    return {"probability": p, "low": low, "high": high, "unmet": 0.0, "gate": None} | rest
+
+
+def test_what_no_run_has_met_is_in_the_verdict_of_a_rare_comparison():
+    """An estimate by transfer does not see a new region: fell was said of a P that was the same, in 4 of 8."""
+    from sbt.cli.compare_ego import _rare_lines
+    from sbt.workflows.paired import _rare_verdict
+
+    old, new = _estimate(0.01, 0.0098, 0.0102, unmet=0.1), _estimate(0.005, 0.0049, 0.0051)
+    assert _rare_verdict(old, new, -0.0053, -0.0047) == {"verdict": "fell", "condition": None, "open": None}
+    fell = _rare_verdict(old, new | {"unmet": 0.03, "gate": {"verdict": "pass", "statement": ""}}, -0.0053, -0.0047)
+    assert fell["verdict"] == "fell"
+    assert fell["condition"].startswith("if the search has met whatever is critical")
+    assert "no run of the second" in fell["condition"]
+    assert fell["condition"].endswith("0.03")
+    assert _rare_verdict(old, new | {"unmet": 0.004}, -0.0053, -0.0047)["condition"] is None, "it could not undo it"
+    denied = "a draw was critical where the metamodel denied it"
+    surprised = {"verdict": "undecided", "statement": denied, "upper": 0.0051, "probability": 0.01}
+    told = _rare_verdict(old, new | {"gate": surprised}, -0.0053, -0.0047)
+    assert told == {"verdict": "undecided", "condition": None, "open": f"of the second: {denied}"}
+    earlier = surprised | {"probability": 0.005}  # of an estimate with fewer runs, which this one is not below
+    assert _rare_verdict(old, new | {"gate": earlier}, -0.0053, -0.0047)["verdict"] == "fell"
+    rose = _rare_verdict(old, new, 0.001, 0.002)
+    assert rose["verdict"] == "rose"
+    assert "no run of the first" in rose["condition"]
+    assert _rare_verdict(old, new, -0.001, 0.002)["condition"] is None
+    said = {"precise": True, "runs": 60, "failed": 0}
+    lines = _rare_lines({"before": old | said, "after": new | said, "difference": -0.005, "low": -0.0053, "high": -0.0047,
+                         "confidence": 0.95, **fell})  # fmt: skip
+    assert lines[3].endswith(f": fell, {fell['condition']}")
+
+
+def test_a_rare_comparison_searches_the_second_ego(configured, tmp_path):
+    """With what the first one taught alone, its start and search were left out."""
+    (tmp_path / "analytic.py").write_text((tmp_path / "analytic.py").read_text() + """
+
+def better(values, seed):
+    return {"y": disc(values, seed)["y"] + 0.1, "noise": 0.0}
+
+
+BETTER = scenario(better)
+""")
+    a, b = (configured(*each, budget=60, metamodel={"kind": "gp"}) for each in (("a",), ("b", "BETTER")))
+    command = ["compare-ego", str(a), str(b), "--rare", "--store", str(tmp_path / "both"), "--json"]
+    done = CliRunner().invoke(app, command)
+    assert done.exit_code == 0, done.output
+    found = json.loads(done.stdout)
+    gate = found["after"]["gate"]
+    assert gate["probability"] == found["before"]["probability"]
+    with Store.read(tmp_path / "both" / "b") as store:
+        stages = set(store.history().stage)
+    assert "initial" in stages
+    again = CliRunner().invoke(app, [*command, "--runs", "70"])
+    assert again.exit_code == 0, again.output
+    assert json.loads(again.stdout)["after"]["gate"]["probability"] == gate["probability"], "what it began with"
 
 
 def test_different_questions_are_refused(configured, tmp_path):

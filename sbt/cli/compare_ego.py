@@ -71,6 +71,8 @@ def _rare_lines(result: Mapping[str, Any]) -> list[str]:
         short = "" if s["precise"] else "; a coefficient of variation of 10 % is not reached: more --runs"
         lines.append(f"  {name:<8}{p} ({s['low']:.4g} to {s['high']:.4g}), {s['runs']} runs, {s['failed']} failed{short}")
     by = "unknown" if result["difference"] is None else f"{result['difference']:+.4g}"
-    lines.append(f"  change  {by} ({result['low']:+.4g} to {result['high']:+.4g}): {result['verdict']}")
+    condition = f", {result['condition']}" if result.get("condition") else ""
+    lines.append(f"  change  {by} ({result['low']:+.4g} to {result['high']:+.4g}): {result['verdict']}{condition}")
+    lines += [f"  {result['open']}"] if result.get("open") else []
     warm_ups = [result[name].get("warm_ups", 0) for name in ("before", "after")]
     return [*lines, f"  conditional on the traffic of {max(warm_ups)} warm-ups"] if any(warm_ups) else lines

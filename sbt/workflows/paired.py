@@ -4,7 +4,8 @@ Both configurations run as crude Monte Carlo with one seed: draws of the inputs 
 the same (common random numbers), so that only the runs with different verdicts tell the egos apart.
 
 Where critical runs are rare, pairs tell nothing. Then each ego has an estimation of its own, and the second learns from the
-first: its metamodel is a trend. No run of the first is counted for the second, so that the errors are independent.
+first: its metamodel is a trend. No run of the first is counted for the second, so that the errors are independent. The second
+has the first one's estimate as its gate: a new ego is looked at for what the old one did not do.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ from typing import Any
 import numpy as np
 
 from sbt.campaigns.clustering import clustered_interval
+from sbt.campaigns.counting import random_draws
+from sbt.campaigns.gate import CONDITION
 from sbt.campaigns.wording import number
 from sbt.config.load import load
 from sbt.errors import InputError
@@ -40,6 +43,8 @@ _SECONDS = 20.0
 """... whose runs took at most so long together when they were recorded (s)."""
 _BATCH = 200
 """Runs of a batch of pairs."""
+_NEAR = 1e-9
+"""What is left above a gate, at least."""
 _PRECISE = 0.1
 """Coefficient of variation with which the estimations of rare critical runs end."""
 
@@ -178,8 +183,8 @@ def compare_rare(
         runs: of each estimation at most; None: the budget of the first. They end at a coefficient of variation of 10 %.
 
     Returns:
-        Probabilities with intervals, runs, whether each is as precise, their difference with its interval, and a verdict
-        (`fell`, `rose`, `undecided`).
+        Probabilities with intervals, runs, whether each is as precise, their difference with its interval, a verdict (`fell`,
+        `rose`, `undecided`), and in words on what condition it holds (`condition`; None: on none) or why it is open (`open`).
 
     Raises:
         InputError: as `compare_egos` does.
@@ -196,7 +201,7 @@ def compare_rare(
     one, other = (_study(path, store / name, common) for path, name in ((first, "a"), (second, "b")))
     _check(one, other, (first, second))
     before = _estimated(run_study(one, progress=progress, report=False), store / "a")
-    warm = {"warm_start": {"store": str(store / "a"), "transfer": True}}
+    warm = {"warm_start": {"store": str(store / "a"), "transfer": True}, "gate": _sought(before, store / "b")}
     other = _study(second, store / "b", common | warm)
     after = _estimated(run_study(other, progress=progress, report=False), store / "b")
     p, q = before["probability"], after["probability"]
@@ -205,10 +210,36 @@ def compare_rare(
     else:
         low = q - p - float(np.hypot(q - after["low"], before["high"] - p))
         high = q - p + float(np.hypot(after["high"] - q, p - before["low"]))
-    return {
-        "confidence": _CONFIDENCE, "before": before, "after": after, "difference": None if p is None or q is None else q - p,
-        "low": low, "high": high, "verdict": _verdict(low, high),
-    }  # fmt: skip
+    told = {"confidence": _CONFIDENCE, "before": before, "after": after, "difference": None if p is None or q is None else q - p}
+    return {**told, "low": low, "high": high, **_rare_verdict(before, after, low, high)}
+
+
+def _sought(before: Json, folder: Path) -> Json | None:
+    """Return the gate of the second ego, the estimate of the first: with one there is an even start and a search.
+
+    Where it would pass, draws go on until what none has met is within it, too. A campaign that goes on keeps its own gate, as
+    what is run next depends on it.
+    """
+    if (folder / DATABASE).is_file():
+        with Store.read(folder) as kept:
+            gate = kept.configuration.get("gate")
+            return None if gate is None else dict(gate)
+    p = before["probability"] or before["high"]
+    return {"probability": min(p, 1.0 - _NEAR), "confidence": 0.5 * (1.0 + _CONFIDENCE)} if p > 0.0 else None
+
+
+def _rare_verdict(before: Json, after: Json, low: float, high: float) -> Json:
+    """Return the verdict on two estimations, and its condition: that neither search has left out what would undo it."""
+    verdict, gate = _verdict(low, high), after["gate"]
+    doubted = gate is not None and gate["verdict"] == "undecided" and gate["upper"] <= gate["probability"]  # what draws deny
+    if verdict == "fell" and doubted:
+        return {"verdict": "undecided", "condition": None, "open": f"of the second: {gate['statement']}"}
+    undoing = {"fell": (after["unmet"], -high, "second"), "rose": (before["unmet"], low, "first")}
+    unmet, least, which = undoing.get(verdict, (0.0, np.inf, ""))
+    if unmet < least:
+        return {"verdict": verdict, "condition": None, "open": None}
+    region = f"a critical region that no run of the {which} has met, or failures that few seeds show,"
+    return {"verdict": verdict, "condition": f"{CONDITION}; {region} could hold up to {unmet:.2g}", "open": None}
 
 
 def _study(path: Path, store: Path, changes: Mapping[str, Any]) -> Study:
@@ -236,8 +267,10 @@ def _estimated(summary: Summary, folder: Path) -> Json:
     traffic = found.get("warmed_traffic")
     warmed = {} if traffic is None else {"warm_ups": traffic["warm_ups"]}
     precise = found["cov"] is not None and found["cov"] <= _PRECISE
-    failed = int((~history.ok).sum())
-    return {**kept, **warmed, "precise": precise, "runs": len(history), "critical": found["hits"], "failed": failed}
+    failed, drawn = int((~history.ok).sum()), random_draws(history)
+    every = found.get("combinations") is not None or found["counted"] == drawn > 0  # limits have what no run has met
+    rest = {"unmet": 0.0 if every else kept["undetected_mass_bound"], "gate": found.get("gate")}
+    return {**kept, **warmed, "precise": precise, "runs": len(history), "critical": found["hits"], "failed": failed, **rest}
 
 
 def _verdict(low: float, high: float) -> str:
