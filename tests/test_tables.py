@@ -316,3 +316,15 @@ def test_rows_over_decades_say_that_their_input_is_even_in_the_logarithm(tmp_pat
         assert said or " r " not in notes, name
     with pytest.raises(InputError, match=r"logarithmic.*0 < min.*hundred"):
         foreign(tmp_path / "wrong", even, ", min: 0, logarithmic: true")
+
+
+@pytest.mark.parametrize("high", [-0.1, 9.0, -9.0])
+def test_no_table_is_told_to_run_what_it_cannot(folder: Path, high: float) -> None:
+    """Its conclusions ended with "campaign: estimation says how probable", which is refused, or with wider ranges."""
+    for campaign, more in (("coverage", {}), ("boundary", {"metamodel": "et"}), ("falsification", {"metamodel": "et"})):
+        need = {"metric": "dist*", "critical": [None, high]}
+        found = asked_again(folder, folder.parent / f"{campaign}{high}", campaign=campaign, requirement=need, **more)
+        (advice,) = (sentence for sentence in found.sentences() if sentence.startswith("Next: "))
+        assert "campaign: estimation" not in advice.replace("campaign: estimation with the simulator that the rows are of", "")
+        assert "widen the ranges" not in advice
+        assert "validation.reference" not in advice

@@ -29,7 +29,7 @@ from sbt.campaigns.reconciling import denial, ends, nowhere_likely, reconciled
 from sbt.campaigns.records import CONFIRM
 from sbt.campaigns.regions import regions_words
 from sbt.campaigns.sides import all_critical, few_of_a_side, met, none_critical, safe_runs
-from sbt.campaigns.wording import measured, number, percent, plural, requirement_words
+from sbt.campaigns.wording import estimating, measured, number, percent, plural, requirement_words, widening
 from sbt.estimators.binomial import interval, unmet_draws
 from sbt.loop.stages import Facts
 
@@ -43,7 +43,6 @@ if TYPE_CHECKING:
 __all__ = ["tell_boundary", "tell_estimation", "tell_failures", "tell_share"]
 
 _TOO_FAR = 1e6  # a number of runs that nobody is advised to make
-_WIDEN = "widen the ranges of the inputs, or change the requirement: where all is critical there is nothing to tell apart"
 _SMALL_SHARE = 0.01  # bound of the critical share that a coverage of 300 runs without a critical one gives
 
 
@@ -59,14 +58,14 @@ def tell_share(share: CriticalShare, facts: Facts) -> list[str]:
         said = f"No run{where} was critical ({_condition(facts)}): {most} ({ends(share)})"
         further = "campaign: falsification searches for the rare critical run; as many even runs again only halve the bound"
     elif share.critical_fraction == 1.0:
-        further = _WIDEN
+        further = widening(facts.recorded)
     elif decides_share(lost, share.counted, share.low, share.high):
         further = f"failed runs decide the width of this interval, and more runs never halve it: {why_they_fail()}"
     elif (warm_ups := _deciding_warm_ups(share, facts)) is not None:
         further = _more_warm_ups(warm_ups)
     else:
         further = (
-            f"campaign: boundary says where critical runs lie, campaign: estimation how probable they are; about"
+            f"campaign: boundary says where critical runs lie, {estimating(facts.recorded)} how probable they are; about"
             f" {rounded(3 * share.counted):,} more runs would halve this interval"
         )
     return [
@@ -143,7 +142,7 @@ def tell_boundary(found: BoundaryConclusion, measured_share: CriticalShare, fact
 
 def _after_boundary(found: BoundaryConclusion, facts: Facts, *, tested: bool) -> str:
     if all_critical(facts):
-        return _WIDEN
+        return widening(facts.recorded)
     if not tested and facts.recorded:
         return "test it: a smaller budget leaves rows that score the metamodel"
     if not tested:
@@ -159,7 +158,7 @@ def _after_boundary(found: BoundaryConclusion, facts: Facts, *, tested: bool) ->
         return "campaign: falsification searches for the rare critical run"
     return (
         f"twice the budget puts as many runs again where the metamodel is unsure, {percent(unsure)} of the space now;"
-        " campaign: estimation says how probable the critical side is"
+        f" {estimating(facts.recorded)} says how probable the critical side is"
     )
 
 
@@ -199,7 +198,7 @@ def tell_failures(found: FalsificationConclusion, random: CriticalShare, facts: 
     never = ", with its own seed, as no repetition failed" if often is not None and often.confirmed == 0.0 else ""
     look = "" if often is None else f"look at run {often.representative} (replay) and keep it as a test (pin{never}); "
     rest = "every combination of the inputs was run" if exhausted else "a larger budget looks for more modes"
-    more = f"{look}campaign: estimation says how probable failures are, {rest}"
+    more = f"{look}{estimating(facts.recorded)} says how probable failures are, {rest}"
     return [said, f"{silent}.", f"Next: {more}."]
 
 
@@ -354,7 +353,7 @@ def _after_estimation(found: EstimationConclusion, facts: Facts) -> str:
     if found.combinations is not None and found.probability == 0.0:
         return "ten times as many runs bring the upper end of the interval to a tenth"
     if all_critical(facts):
-        return _WIDEN
+        return widening(facts.recorded)
     if found.gate is not None and found.gate.verdict == "undecided":
         ends = f", with stop: {{cov: null}} as the campaign ends at {percent(PRECISE)} of the estimate otherwise"
         ends = ends if found.cov is not None and found.cov <= PRECISE else ""

@@ -10,7 +10,10 @@ from typing import Any
 from sbt.problem.combination import CombinedRequirement
 from sbt.problem.requirement import Requirement
 
-__all__ = ["NOTHING", "measured", "mixture_shares", "number", "percent", "plural", "requirement_words", "written_unit"]
+__all__ = [
+    "NOTHING", "estimating", "measured", "mixture_shares", "number", "percent", "plural", "requirement_words", "widening",
+    "written_unit",
+]  # fmt: skip
 
 _NIL = 1e-30  # a rounding error of what is zero
 _NO_SHARE = 1e-15  # a share that is a tail of a metamodel's, and nothing else
@@ -99,3 +102,14 @@ def mixture_shares(weights: Mapping[str, float]) -> str:
     """
     parts = sorted(((-weight, name) for name, weight in weights.items() if weight > 0.0))
     return ", ".join(f"{100 * -weight:.0f}\N{NO-BREAK SPACE}% {name}" for weight, name in parts)
+
+
+def estimating(recorded: bool) -> str:
+    """Return what says how probable failures are; of recorded rows only what made them can."""
+    return f"campaign: estimation{' with the simulator that the rows are of' if recorded else ''}"
+
+
+def widening(recorded: bool) -> str:
+    """Return what to do where all is critical; recorded rows have no wider ranges."""
+    wider = "" if recorded else "widen the ranges of the inputs, or "
+    return f"{wider}change the requirement: where all is critical there is nothing to tell apart"
