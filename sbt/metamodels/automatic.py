@@ -28,6 +28,7 @@ from sbt.metamodels.deep_ensemble import Ensemble
 from sbt.metamodels.extra_trees import ExtraTrees
 from sbt.metamodels.gaps import better_without_gap
 from sbt.metamodels.gaussian_process import GaussianProcess
+from sbt.metamodels.labelled import better_labelled
 from sbt.metamodels.noise_shape import better_uneven, shaped
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.rated import better_rate
@@ -68,8 +69,8 @@ class Auto:
     nu 2.5 and one noise, is taken alone unless the mixture is better by three standard errors, and better over the space, too
     (rows crowd at the edge, where a mixture that hedges looks better than it is). Where the metric jumps at the edge, `gp`
     learns a widened jump if that predicts the sides better (see `stepped`); of a noisy one, noise that depends on the inputs
-    (`noise_shape`), or the rate of two values (`rated`). Where it leaves next to nothing to gain, the others are not even
-    tried.
+    (`noise_shape`), the rate of two values (`rated`), or beside other values how often runs are critical (`labelled`). Where it
+    leaves next to nothing to gain, the others are not even tried.
 
     Args:
         folds: of the cross-validation, >= 2.
@@ -162,6 +163,9 @@ class Auto:
         rated = better_rate(self.simplest, own, bins.critical, u, y, rng)
         process: Predictor = rated[0] if rated is not None else values if sided is None else sided[0]
         own = own if rated is None else own + rated[1]
+        labelled = better_labelled(self.simplest, values, bins.critical, u, y, shares, rng)
+        if labelled is not None:  # of ranges beside the edge labels tell nothing
+            (process, own), bins = labelled, replace(bins, near=np.inf)
         rounded = None if told is None else better_rounded(told, own, bins.critical, u, y, bins.warp, shares, rng)
         process = process if rounded is None else rounded[0]
         own = own if rounded is None else own + rounded[1]
