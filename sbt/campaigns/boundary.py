@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 
 from sbt.acquisitions import even, is_greedy
+from sbt.campaigns.chance import ChancePlace, chance_place
 from sbt.campaigns.choices import ChoiceRule, from_roi, greedily, mixed
 from sbt.campaigns.combinations import EveryCombination, every_combination
 from sbt.campaigns.doubt import TrafficDoubt, traffic_doubt
@@ -19,9 +20,9 @@ from sbt.campaigns.likely import CriticalCombinations, critical_combinations
 from sbt.campaigns.lost import none_gave_a_metric, nothing_known
 from sbt.campaigns.openness import by_chance, failing_range, failing_words, open_range
 from sbt.campaigns.parts import BatchStage, CriticalShare, critical_share, share_among_held_out
-from sbt.campaigns.place import BoundaryPlace, boundary_place, succeeding
+from sbt.campaigns.place import BoundaryPlace, LogOdds, boundary_place, succeeding
 from sbt.campaigns.regions import CriticalRegion, critical_regions
-from sbt.campaigns.repeats import SimulatorNoise, stated_noise
+from sbt.campaigns.repeats import SimulatorNoise, simulator_noise, stated_noise
 from sbt.campaigns.settings import CampaignKind, Settings
 from sbt.campaigns.telling import tell_boundary
 from sbt.campaigns.warmed import conditional_on
@@ -70,6 +71,7 @@ class BoundaryConclusion:
         fails_by_chance: nothing shows that inputs decide which runs fail; None: none fails.
         failing_range: ends of the failing fraction; None: it is not known to be a part of the space.
         critical_combinations: where no input is continuous; None: one is, or the metamodel sees none.
+        chance_place: where runs of a noisy simulator are critical most often, though not most of them are; None: most are.
     """
 
     critical_fraction: float | None
@@ -95,6 +97,7 @@ class BoundaryConclusion:
     fails_by_chance: bool | None = optional()
     failing_range: tuple[float, float] | None = optional()
     critical_combinations: CriticalCombinations | None = optional()
+    chance_place: ChancePlace | None = optional()
 
     def to_dict(self) -> Json:
         """Return the JSON of the command line."""
@@ -166,6 +169,7 @@ def recipe(settings: Settings) -> Campaign:
             critical_share(log.history.where(unchosen), settings.scenario), by_chance(fitted),
             failing_range(learner, fitted, len(log.history.finished)),
             None if every is not None else critical_combinations(log_odds, settings.scenario, fitted.log_success),
+            _by_chance(log_odds, log.history, settings) if every is None else None,
         ), fitted  # fmt: skip
 
     most = largest_batch if settings.acquisition is None else None
@@ -183,6 +187,16 @@ def _met(history: History, settings: Settings) -> Points:
     """Return (k, d) critical runs, in the unit cube."""
     scenario = settings.scenario
     return scenario.space.cube.snapped(scenario.space.to_unit(history.x[scenario.requirement.critical_runs(history)]))
+
+
+def _by_chance(log_odds: LogOdds, history: History, settings: Settings) -> ChancePlace | None:
+    """Return where runs of a noisy simulator are critical most often, though not most of them are; else None."""
+    scenario = settings.scenario
+    if scenario.pool is not None or not simulator_noise(history, scenario.requirement).noisy:
+        return None
+    runs = history.where(history.ok & history.drawn)
+    u = scenario.space.cube.snapped(scenario.space.to_unit(runs.x))
+    return chance_place(log_odds, scenario, settings.seed, u, scenario.requirement.critical_runs(runs))
 
 
 def _log_odds(fitted: FittedMetamodel, settings: Settings, u: Points) -> Vector:

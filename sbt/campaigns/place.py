@@ -84,8 +84,8 @@ class BoundaryPlace:
         """Whether an edge is less certain than the critical stretch beside it is wide."""
         return any(cut.unsure >= min(s.high - s.low for s in cut.critical) for cut in self.cuts)
 
-    def words(self, units: Mapping[str, str]) -> str:
-        """Return where critical meets uncritical, in words."""
+    def words(self, units: Mapping[str, str], *, edges: bool = True) -> str:
+        """Return where critical meets uncritical, in words; with how sure `edges` are."""
         first, unit = self.inputs[0], units.get(self.inputs[0], "")
         second = self.inputs[1] if len(self.inputs) > 1 else ""
         at = ["" if cut.at is None else measured("", cut.at, units.get(second, "")).strip() for cut in self.cuts]
@@ -96,7 +96,8 @@ class BoundaryPlace:
                 parts.append(f"{' and '.join(dict.fromkeys(self._stretches(cut, unit)))}{where}")
         unsure = measured("", max(cut.unsure for cut in self.cuts), unit, 2).strip()
         lost = ", as far as runs give a metric" if any(cut.lost for cut in self.cuts) else ""
-        said = f"{first} is {', '.join(parts)}{lost} (edges \N{PLUS-MINUS SIGN}{unsure} at worst, by the metamodel)"
+        sure = f" (edges \N{PLUS-MINUS SIGN}{unsure} at worst, by the metamodel)" if edges else ""
+        said = f"{first} is {', '.join(parts)}{lost}{sure}"
         if self.fixed:
             names = sorted(self.fixed, key=lambda name: -self.weights.get(name, 0.0))
             told = [measured(name, self.fixed[name], units.get(name, "")) for name in names[:_MOST_FIXED]]

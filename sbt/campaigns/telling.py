@@ -108,7 +108,7 @@ def tell_boundary(found: BoundaryConclusion, measured_share: CriticalShare, fact
     else:
         sure = "no held-out run tested it"
     few = few_of_a_side(facts)
-    if found.place is not None:
+    if found.place is not None and found.chance_place is None:
         section = found.place.words(facts.units)
         unsharp = bool(few) or found.place.vague
         regions = () if unsharp or found.regions is None else found.regions  # roughness would be counted
@@ -122,6 +122,8 @@ def tell_boundary(found: BoundaryConclusion, measured_share: CriticalShare, fact
             )
     else:
         lead = nowhere_likely(found, _of(facts), _condition(facts), few)
+    if found.chance_place is not None:
+        lead = found.chance_place.words(_of(facts, "In").strip() or "Here", _condition(facts), facts.units)
     if none_critical(facts):
         lead = f"No run{_of(facts)} was critical ({_condition(facts)}), and the metamodel knows no place where one is likely"
     elif all_critical(facts):
@@ -135,7 +137,7 @@ def tell_boundary(found: BoundaryConclusion, measured_share: CriticalShare, fact
         f" region smaller than the gaps between {plural(learned, 'run')} may be missing from it.",
         f"Next: {_every_combination(facts)}{_after_boundary(found, facts, tested=tested)}.",
     ]
-    if found.place is not None and where != section and not none_critical(facts):
+    if found.place is not None and found.chance_place is None and where != section and not none_critical(facts):
         said.append(f"On lines across the boundary, a run is critical where {section}.")
     return [*said, *reconciled(found, measured_share, learned, recorded=facts.recorded)]
 
