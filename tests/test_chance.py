@@ -57,3 +57,15 @@ def test_a_conflict_of_some_seeds_is_not_told_as_one_of_all(tmp_path: Path):
     first = result.sentences()[0]
     assert "a run is critical (y ≤ 1) where" not in first
     assert result.conclusion.critical_fraction == pytest.approx(0.09, abs=0.05)
+
+
+def test_no_place_is_told_by_runs_that_chance_would_put_there_as_well():
+    """Three critical runs of a coin, all in the half of the space where a metamodel expects them, which has learned from them."""
+    inputs = [sbt.Parameter("a", 0.0, 1.0), sbt.Parameter("b", 0.0, 1.0)]
+    scenario = sbt.Scenario("coin", inputs, sbt.Requirement("y", high=0.0), evaluate=lambda values, seed: {"y": 1.0})
+    u = SobolSequence(2, 3).points(0, 50)
+    hit = np.zeros(50, dtype=bool)
+    hit[np.flatnonzero(inside(u))[:3]] = True
+    assert chance_place(lambda v: np.where(inside(v), -1.5, -6.0), scenario, 0, u, hit) is None
+    hit[np.flatnonzero(inside(u))[:10]] = True
+    assert chance_place(lambda v: np.where(inside(v), -1.5, -6.0), scenario, 0, u, hit) is not None

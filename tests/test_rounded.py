@@ -153,3 +153,23 @@ def test_the_predictor_of_a_rounded_metric_is_the_one_that_knows_ranges():
     mixture = getattr(predictor, "predictor", predictor)
     mixture = getattr(mixture, "predictor", mixture)
     assert any(isinstance(each, RoundedPredictor) for each in mixture.predictors)
+
+
+def test_steps_are_known_but_for_the_last_digits():
+    """A post-encroachment time is a difference of multiples of the step: .1 + .2 is not .3."""
+    u, rng = SobolSequence(2, 1).points(0, 120), stream(1, "late")
+    late = rng.integers(0, 300, 120)
+    y = (late + np.round(12.0 * u[:, 0] + 8.0 * u[:, 1])) * 0.1 - late * 0.1
+    assert len(np.unique(y)) > 1.5 * len(np.unique(np.round(y, 6)))
+    told = rounding(u, y, CriticalInterval(high=0.55))
+    assert told is not None
+    assert (told.edge, told.width) == (pytest.approx(0.55), pytest.approx(0.1))
+    p = Opened(QUICK, CriticalInterval(high=0.55)).fit(u, y, stream(1, "fit"))(u).probability(CriticalInterval(high=0.55))
+    assert ((p > 0.5) == (y <= 0.55)).mean() > 0.97
+    assert rounding(u, y, CriticalInterval(high=0.6)) is None  # which of them are critical is decided by the last digits
+    few = np.repeat([0.0, 0.001, 1.00037, 2.7], 30)
+    found = rounding(u, few, CriticalInterval(high=0.0005))
+    assert found is not None
+    assert found.width == pytest.approx(0.001)
+    assert found.high[-1] == np.inf
+    assert found.low[-1] == pytest.approx(0.5 * (1.00037 + 2.7))  # no lattice of .001

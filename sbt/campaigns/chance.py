@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import hypergeom
 
 from sbt.campaigns.place import BoundaryPlace, LogOdds, boundary_place
 from sbt.campaigns.wording import percent, plural
@@ -19,6 +20,7 @@ _POINTS, _LEAST = 4096, 1024
 _LARGEST = 0.99  # quantile of P(critical) over the space that counts as its largest
 _HALF = 0.5  # of it: the least in the place
 _UNEVEN = 2.0  # times its mean, below which inputs decide too little to name a place
+_CHANCE = 0.01  # P(as many of the critical runs lie in a place that tells nothing), up to which one is named: runs chose it
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,19 @@ def chance_place(log_odds: LogOdds, scenario: LogicalScenario, seed: int, u: Poi
     if least < _HALF * _UNEVEN * float(p.mean()) or (not likely.any() and bool((p > 0.5).any())):
         return None
     above = np.log(least / (1.0 - least))
-    place, there = boundary_place(lambda v: log_odds(v) - above, scenario, seed), log_odds(u) > above
-    if place is None or not hit[there].any():
+    there = log_odds(u) > above
+    if not hit[there].any() or _as_elsewhere(hit, there) > _CHANCE:
+        return None
+    place = boundary_place(lambda v: log_odds(v) - above, scenario, seed)
+    if place is None:
         return None
     return ChancePlace(place, int(there.sum()), int(hit[there].sum()))
+
+
+def _as_elsewhere(hit: Mask, there: Mask) -> float:
+    """Return how likely so many of the critical runs, or more, lie in a place if runs are critical as often elsewhere.
+
+    Source:
+        Fisher's exact test.
+    """
+    return float(hypergeom.sf(int((hit & there).sum()) - 1, len(hit), int(hit.sum()), int(there.sum())))

@@ -29,6 +29,8 @@ _FEWEST, _TIED = 10, 0.5
 """Rows, and the least share of those between the first and the last value that have the value of a row elsewhere."""
 _WHOLE = 1e-3
 """Of a step: how far multiples of it may be off."""
+_SAME, _FINEST = 1e-9, 1e-6
+"""Of the range of y: within which values are the same but for rounding, and the least step."""
 _LEARNED, _MOST = 200, 1000
 """Rows that hyperparameters are found by, and that are learned from, at most: half of them those nearest to the edge."""
 _LENGTH, _NOISE = 0.3, 0.03
@@ -37,7 +39,7 @@ _BOUNDS = ((-3.5, 4.0), (-4.0, 3.0), (-30.0, 30.0), (math.log(1e-3), 1.0))
 """Of log lengths, log spread, mean and log noise, in standard deviations of y."""
 _SURE, _SURELY_WORSE = 1.0, 2.0
 """Standard errors by which left-out runs must be predicted better, of a flag or with noise, and otherwise may not be worse."""
-_SAME = 1e-9
+_AT_EDGE = 1e-9
 """Standard deviations of y, within which the edge is reached."""
 
 
@@ -81,12 +83,12 @@ def rounding(u: Points, y: Vector, critical: CriticalInterval) -> Rounding | Non
     """
     if not critical.one_sided or len(y) < _FEWEST:
         return None
-    values, which = np.unique(y, return_inverse=True)
+    values, which, inside = _values(y, critical)
     between = (which > 0) & (which < len(values) - 1)
     tied = np.bincount(np.unique(np.column_stack([which, u]), axis=0)[:, 0].astype(np.intp)) > 1
-    if len(values) < 2 or (tied[which[between]].mean() < _TIED if between.any() else not tied.all()):
+    if inside is None or len(values) < 2 or (tied[which[between]].mean() < _TIED if between.any() else not tied.all()):
         return None
-    step, inside = _step(values), critical.contains(values)
+    step = _step(values)
     if step is not None:
         sign, low, high, width = critical.outward, values - 0.5 * step, values + 0.5 * step, step
         last = float(values[0]) + sign * step * math.floor(sign * float(critical.edge - values[0]) / step + _WHOLE)  # critical
@@ -102,12 +104,26 @@ def rounding(u: Points, y: Vector, critical: CriticalInterval) -> Rounding | Non
     return Rounding(low[which], high[which], edge, width)
 
 
+def _values(y: Vector, critical: CriticalInterval) -> tuple[Vector, NDArray[np.intp], Mask | None]:
+    """Return the different values (k,) of y (n,), which one each is, and whether they are critical; None: rounding decides that.
+
+    Times and sums that are multiples of a step are so but for the last digits.
+    """
+    every, which = np.unique(y, return_inverse=True)
+    first = np.diff(every, prepend=-np.inf) > _SAME * np.ptp(every)
+    group = np.cumsum(first) - 1
+    inside = critical.contains(every)
+    mixed = np.unique(np.column_stack([group, inside]), axis=0).shape[0] > int(first.sum())
+    return every[first], group[which], None if mixed else inside[first]
+
+
 def _step(values: Vector) -> float | None:
     """Return the size of which all differences of values (k,), increasing, are multiples; None where there is none."""
     apart = np.diff(values)
-    step = float(apart.min())
-    times = apart / step
-    return step if bool((np.abs(times - np.round(times)) < _WHOLE * times).all()) else None
+    step, range_ = float(apart.min()), float(values[-1] - values[0])
+    step = range_ / round(range_ / step)  # less of the rounding of one difference
+    times = (values - values[0]) / step
+    return step if step > _FINEST * range_ and bool((np.abs(times - np.round(times)) < _WHOLE).all()) else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +185,7 @@ class RoundedPredictor:
         moved = np.interp(at, knots, [knots[0], end - 0.5 * w, end + 0.5 * w, knots[3]])
         y = np.where((at < knots[0]) | (at > knots[3]), at, moved)
         y = y if self.warp is None else self.warp.values(y)
-        near = np.abs(off) < _SAME
+        near = np.abs(off) < _AT_EDGE
         return y, np.where(near, 1.0, (y - edge) / np.where(near, 1.0, self.scale * off))
 
 

@@ -25,7 +25,8 @@ class _Body(Protocol):
 
 def discs_of(a: _Body, b: _Body) -> Any:
     """Return the distance at which two persons touch (m), NaN where one of them is none; None where none are."""
-    if isinstance(a.length, float) and isinstance(b.length, float) and max(a.length, a.width, b.length, b.width) >= _PERSON:
+    single = isinstance(a.length, float | int) and isinstance(b.length, float | int)
+    if single and max(a.length, a.width, b.length, b.width) >= _PERSON:
         return None  # quickly, as this is asked of every pair at every step
     larger = [np.maximum(each.length, each.width) for each in (a, b)]
     persons = np.maximum(*larger) < _PERSON

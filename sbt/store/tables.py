@@ -85,13 +85,13 @@ def _kept(rows: Mapping[str, Vector], inputs: list[str], outputs: list[str]) -> 
     """Return the rows that are runs, and in a sentence how many are none.
 
     A run has finite inputs and all outputs, which may be infinite. Rows of the same inputs are copies of one run where they
-    have the same seed, or, of a table without seeds, where nowhere the same inputs have other outputs.
+    have the same seed and outputs, or, of a table without seeds, where nowhere the same inputs have other outputs.
     """
     x, y = (np.column_stack([rows[column] for column in columns]) + 0.0 for columns in (inputs, outputs))  # zero has no sign
     complete = np.flatnonzero(np.isfinite(x).all(axis=1) & ~np.isnan(y).any(axis=1))
     x, y = x[complete], y[complete]
     seeded = _SEED in rows and _SEED not in [*inputs, *outputs]
-    same = np.column_stack([x, rows[_SEED][complete]]) if seeded else x
+    same = np.column_stack([x, y, rows[_SEED][complete]]) if seeded else x
     drawn = not seeded and len(np.unique(np.column_stack([x, y]), axis=0)) > len(np.unique(x, axis=0))
     kept = complete if drawn else complete[np.sort(np.unique(same, axis=0, return_index=True)[1])]
     every = len(rows[inputs[0]])
