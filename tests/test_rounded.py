@@ -173,3 +173,14 @@ def test_steps_are_known_but_for_the_last_digits():
     assert found.width == pytest.approx(0.001)
     assert found.high[-1] == np.inf
     assert found.low[-1] == pytest.approx(0.5 * (1.00037 + 2.7))  # no lattice of .001
+
+
+def test_ranges_are_learned_in_the_unit_in_which_they_are_likeliest():
+    """Steps of an even slope: least squares chose a unit of theirs for a third of such runs, in which what was rounded is bent."""
+    critical, wrong = CriticalInterval(low=5.0), []
+    for seed in (4, 5):
+        u, new = stream(seed, "u").random((100, 2)), stream(seed, "new").random((4000, 2))
+        y, truth = np.floor(6.0 * u.sum(axis=1)), 6.0 * new.sum(axis=1) >= 5.0
+        p = Opened(QUICK, critical).fit(u, y, stream(1, "fit"))(new).probability(critical)
+        wrong.append(float(((p > 0.5) != truth).mean()))
+    assert np.mean(wrong) < 0.01

@@ -32,7 +32,7 @@ from sbt.metamodels.labelled import better_labelled
 from sbt.metamodels.noise_shape import better_uneven, shaped
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.rated import better_rate
-from sbt.metamodels.rounded import Rounding, better_rounded
+from sbt.metamodels.rounded import Rounding, better_rounded, without_unit
 from sbt.metamodels.sided import better_sided
 from sbt.metamodels.stacking import Bins, cell_shares, held_out_scores, is_surely_better, mixture_score, stacking_weights
 from sbt.metamodels.stepped import better_stepped
@@ -228,7 +228,7 @@ class _TargetedAuto:
         u, y, told = u[kept], y[kept], None if self.told is None else self.told.take(kept)
         warp = better_warp(self.settings.simplest, u, y, self.critical)
         warp = better_without_gap(self.settings.simplest, u, y, self.critical, warp) or warp
-        if warp is None:
+        if warp is None or (told is not None and without_unit(told, self.critical, u, y, warp, rng)):
             return self.settings._fit(u, y, rng, self.critical, told=told)
         warp = warp.reaching(y)
         return WarpedPredictor(self.settings._fit(u, warp.values(y), rng, warp.interval(self.critical), warp, told), warp)

@@ -23,7 +23,7 @@ from sbt.metamodels.warp import Warp
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
-__all__ = ["RoundedPredictor", "Rounding", "StepAware", "better_rounded", "rounding"]
+__all__ = ["RoundedPredictor", "Rounding", "StepAware", "better_rounded", "rounding", "without_unit"]
 
 _FEWEST, _TIED = 10, 0.5
 """Rows, and the least share of those between the first and the last value that have the value of a row elsewhere."""
@@ -208,23 +208,49 @@ def better_rounded(
     scale, inside = float(np.std(y)), critical.contains(y)
     if not scale > 0.0:
         return None
-    low, high, edge = (
-        ends if warp is None else warp.values(ends) for ends in (told.low, told.high, np.array(told.edge))
-    )  # fmt: skip
-    low, high, d = (low - edge) / scale, (high - edge) / scale, u.shape[1]
     near = np.argsort(np.abs(y - critical.edge), kind="stable")
     few, rows = (_some(near, most, rng) for most in (_LEARNED, _MOST))
-    start = Hyper(np.full(d, _LENGTH * math.sqrt(d)), 1.0, float(np.mean(y - critical.edge)) / scale, _NOISE)
-    priors = Priors(
-        (math.sqrt(2.0) + 0.5 * math.log(d), math.sqrt(3.0)), (0.0, 1.0), (0.0, 2.0), (math.log(0.01), 2.0), _BOUNDS
-    )  # fmt: skip
-    hyper, _ = fitted(u[few], low[few], high[few], start, priors)
+    hyper, _, (low, high) = _learned(told, critical, u, y, warp, few)
     belief = believe(hyper, hyper.covariance(u[rows])[0], low[rows], high[rows])
     found = RoundedPredictor(u[rows], hyper, belief, scale, told.edge, told.width, critical, warp)
     gain = found.log_sides(u, inside, rows) - score
     others = len(np.unique(told.low)) == 2 or gives_different(u, y)  # learn sides, or how often there is noise, as well
     better = surely_positive(gain, _SURE) and float(shares @ gain) > 0.0 if others else not surely_positive(-gain, _SURELY_WORSE)
     return (found, gain) if better else None
+
+
+def without_unit(
+    told: Rounding, critical: CriticalInterval, u: Points, y: Vector, warp: Warp | None, rng: np.random.Generator
+) -> bool:  # fmt: skip
+    """Return whether ranges are as likely without a unit, which least squares on the steps have chosen.
+
+    Args:
+        told: what each row tells.
+        critical: M_c, in the unit of the metric.
+        u: (n, d) rows.
+        y: (n,) their metric, as it is learned.
+        warp: the unit; None: there is none.
+        rng: the only source of randomness.
+    """
+    if warp is None or not np.std(y) > 0.0:
+        return True
+    few = _some(np.argsort(np.abs(y - critical.edge), kind="stable"), _LEARNED, rng)
+    plain = _learned(told, critical, u, y, None, few)[1]
+    return plain >= _learned(told, warp.interval(critical), u, warp.values(y), warp, few)[1]
+
+
+def _learned(
+    told: Rounding, critical: CriticalInterval, u: Points, y: Vector, warp: Warp | None, few: NDArray[np.intp]
+) -> tuple[Hyper, float, tuple[Vector, Vector]]:  # fmt: skip
+    """Return hyperparameters by few rows, their log posterior density, and the ends of all ranges in the unit of the process."""
+    scale, d = float(np.std(y)), u.shape[1]
+    low, high, edge = (ends if warp is None else warp.values(ends) for ends in (told.low, told.high, np.array(told.edge)))
+    low, high = (low - edge) / scale, (high - edge) / scale
+    start = Hyper(np.full(d, _LENGTH * math.sqrt(d)), 1.0, float(np.mean(y - critical.edge)) / scale, _NOISE)
+    about = math.sqrt(2.0) + 0.5 * math.log(d)
+    priors = Priors((about, math.sqrt(3.0)), (0.0, 1.0), (0.0, 2.0), (math.log(0.01), 2.0), _BOUNDS)
+    hyper, missed = fitted(u[few], low[few], high[few], start, priors)
+    return hyper, -missed, (low, high)
 
 
 def _some(near: NDArray[np.intp], most: int, rng: np.random.Generator) -> NDArray[np.intp]:
