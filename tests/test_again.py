@@ -87,6 +87,7 @@ def test_sensitivities_are_derivatives(estimated):
     assert found.loc[("x1", "std")]["raised"] == pytest.approx(linear(std=1.1), rel=0.2)
 
 
+@pytest.mark.slow
 def test_the_correlation_of_truncated_inputs_is_raised_and_lowered(tmp_path):
     """Far points of a pool are rounded to the end of a range, where a ratio of densities told P = 1."""
     inputs = [sbt.Parameter("gap", 2, 40, "m", sbt.Normal(22, 6)), sbt.Parameter("v", 0, 20, "m/s", sbt.Normal(10, 4))]

@@ -436,6 +436,7 @@ def test_levels_that_other_repeats_set_leave_no_bias(margin, p):
     assert np.mean([g.limit(0.975, side=-1) <= p <= g.limit(0.975, side=1) for g in groups]) >= 0.9
 
 
+@pytest.mark.slow
 def test_upper_limits_of_few_chains_hold():
     """150 points of five repeats a level (budget 600): 13 of 100 ended below P, of 5 allowed."""
     p = 1e-3

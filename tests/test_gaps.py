@@ -73,6 +73,7 @@ def test_flags_plain_metrics_and_few_values_have_no_gap(y):
     assert gap_of(np.array(y), LOW) == (0.0, 0.0)
 
 
+@pytest.mark.slow
 def test_noise_beside_a_jump_does_not_hide_critical_runs(tmp_path: Path):
     """.020 was stated for .113 where -0.3 and 3.3 come from equal inputs: noise seemed to be of the height of the jump."""
 
@@ -94,7 +95,8 @@ def test_noise_beside_a_jump_does_not_hide_critical_runs(tmp_path: Path):
     assert np.abs(said - p).mean() < 0.035
 
 
-@pytest.mark.parametrize("seed", [3, pytest.param(5, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [3, 5])
 def test_where_edges_are_known_runs_fill_the_space(seed: int, tmp_path: Path):
     """Nothing tells of the box: half of what is critical was missed in four of six campaigns."""
 

@@ -176,7 +176,7 @@ def test_steps_are_known_but_for_the_last_digits():
 
 
 def test_ranges_are_learned_in_the_unit_in_which_they_are_likeliest():
-    """Steps of an even slope: least squares chose a unit of theirs for a third of such runs, in which what was rounded is bent."""
+    """Steps of an even slope: least squares chose a unit for a third of such runs, in which what was rounded is bent."""
     critical, wrong = CriticalInterval(low=5.0), []
     for seed in (4, 5):
         u, new = stream(seed, "u").random((100, 2)), stream(seed, "new").random((4000, 2))

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import expit
 from scipy.stats import hypergeom
 
 from sbt.campaigns.place import BoundaryPlace, LogOdds, boundary_place
@@ -20,6 +21,7 @@ _POINTS, _LEAST = 4096, 1024
 _LARGEST = 0.99  # quantile of P(critical) over the space that counts as its largest
 _HALF = 0.5  # of it: the least in the place
 _UNEVEN = 2.0  # times its mean, below which inputs decide too little to name a place
+_FEWEST = 5  # critical runs in a place
 _CHANCE = 0.01  # P(as many of the critical runs lie in a place that tells nothing), up to which one is named: runs chose it
 
 
@@ -61,13 +63,13 @@ def chance_place(log_odds: LogOdds, scenario: LogicalScenario, seed: int, u: Poi
     likely, odds = log_odds(u) > 0.0, np.nan_to_num(log_odds(space.cube.snapped(at)), neginf=-700.0, posinf=700.0)
     if likely.any() and hit[likely].mean() >= 0.5:
         return None
-    p = 1.0 / (1.0 + np.exp(-odds))
+    p = expit(odds)
     least = _HALF * float(np.quantile(p, _LARGEST))
     if least < _HALF * _UNEVEN * float(p.mean()) or (not likely.any() and bool((p > 0.5).any())):
         return None
     above = np.log(least / (1.0 - least))
     there = log_odds(u) > above
-    if not hit[there].any() or _as_elsewhere(hit, there) > _CHANCE:
+    if hit[there].sum() < _FEWEST or _as_elsewhere(hit, there) > _CHANCE:
         return None
     place = boundary_place(lambda v: log_odds(v) - above, scenario, seed)
     if place is None:

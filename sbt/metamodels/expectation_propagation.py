@@ -22,6 +22,7 @@ __all__ = ["Belief", "Hyper", "Priors", "believe", "fitted", "latent", "latent_j
 
 _SWEEPS, _CLOSE, _DAMPED = 40, 1e-5, 0.8  # of expectation propagation: at most, change of log evidence that ends them, step
 _STEPS, _ENOUGH = 40, 1e-4  # of L-BFGS: at most, and relative gain that ends them
+_LEAST_REST = 1e-6  # of the precision of a belief, that other rows must have
 _LOG_ROOT = 0.5 * math.log(2.0 * math.pi)
 _CHUNK = 4096  # points predicted at once
 
@@ -133,8 +134,10 @@ def believe(
     before = math.inf
     for k in range(_SWEEPS):
         lower, pull, middle, variance = _solved(covariance, precision, shift)
-        rest = np.maximum(1.0 / variance - precision, 1e-10)  # without the row
-        beside = (middle / variance - shift) / rest
+        rest = 1.0 / variance - precision  # without the row
+        lost = rest < _LEAST_REST / variance  # what is left of it is rounding
+        rest = np.where(lost, _LEAST_REST / variance, rest)
+        beside = np.where(lost, middle, (middle / variance - shift) / rest)
         log_z, up, bent, by_noise = _moments(low - hyper.mean - beside, high - hyper.mean - beside, 1.0 / rest, hyper.noise)
         log_evidence = (
             float(log_z.sum() + 0.5 * np.log1p(precision / rest).sum() - np.log(np.diag(lower)).sum())
