@@ -13,6 +13,7 @@ from sbt.acquisitions import even
 from sbt.errors import InputError
 from sbt.metamodels.prediction import Prediction
 from sbt.problem.requirement import CriticalInterval
+from sbt.samplers.pool import PoolSequence
 from sbt.samplers.roi import RoiDraw, rejection
 from sbt.samplers.sobol import SobolSequence
 from sbt.testing import check_sampler
@@ -238,3 +239,17 @@ def test_a_bound_of_zero_and_one_from_the_candidates_draw_alike():
 def test_samplers_obey_their_contract():
     check_sampler(lambda n, seed: SobolSequence(3, seed).points(0, n), dimension=3)
     check_sampler(lambda n, seed: rejection(hill, SobolSequence(2, seed), n, start=0, seed=seed, label=0).u, dimension=2)
+
+
+def test_rows_of_a_table_come_once_each_before_any_repeat_of_them():
+    u = np.repeat(SobolSequence(2, 1).points(0, 50), 3, axis=0)
+    taken = np.zeros(150, dtype=bool)
+    first = PoolSequence(u, taken, 1).points(0, 50)
+    assert len(np.unique(first, axis=0)) == 50
+    taken[::3] = True  # the first row of each
+    taken[1] = True  # and a repeat
+    left = PoolSequence(u, taken, 1)
+    assert len(left) == 99
+    assert len(np.unique(left.points(0, 49), axis=0)) == 49
+    alone = PoolSequence(u[::3], np.zeros(50, dtype=bool), 1)
+    assert not np.array_equal(alone.rows, np.arange(50))

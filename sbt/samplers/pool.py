@@ -42,8 +42,13 @@ class PoolSequence:
 
     @cached_property
     def rows(self) -> NDArray[np.int64]:
-        """Indices of the rows that are left, in the order of the sequence."""
+        """Indices of the rows that are left, in the order of the sequence: repeats of a point after all others."""
         order = stream(self.seed, "pool", len(self.u)).permutation(len(self.u))
+        point = np.unique(self.u, axis=0, return_inverse=True)[1].reshape(-1)
+        alike = np.argsort(point, kind="stable")
+        repeat = np.empty(len(self.u), dtype=np.int64)
+        repeat[alike] = np.arange(len(self.u)) - np.searchsorted(point[alike], point[alike])
+        order = order[np.argsort(repeat[order], kind="stable")]
         return order[~self.taken[order]]
 
     def points(self, start: int, stop: int) -> Points:
