@@ -85,3 +85,13 @@ def test_a_classifier_tells_places_from_chance(d: int):
     assert chance.gain < 4.0
     low, high = chance.ends(new)
     assert np.mean((low < 0.7) & (high > 0.7)) > 0.9
+
+
+def test_the_range_of_what_fails_holds_the_share(tmp_path: Path):
+    """A sharp edge between two runs: "24.4 % (24.3 % to 24.3 %)" was told of a quarter."""
+    found = boundary(lambda v, _: v["a"] < 0.25, tmp_path).conclusion
+    low, high = found.failing_range or (0.0, 0.0)
+    assert found.failing_fraction is not None
+    assert low <= found.failing_fraction <= high
+    assert low < 0.25 < high
+    assert high - low >= 2.0 / 90.0

@@ -98,3 +98,17 @@ def test_of_several_requirements_each_is_known_by_its_own_runs(tmp_path: Path):
     assert any(f"critical runs of a requirement are known at {known} input" in text for text in found.warnings)
     assert found.low <= 0.053 <= found.high
     assert found.requirements[1].low <= math.pi * 0.12**2 <= found.requirements[1].high
+
+
+def test_a_metric_of_one_value_is_known_as_soon_as_runs_that_fill_the_space_bound_the_rest(tmp_path: Path):
+    """Of 300 runs, 57 filled the space, so that 6 % might be critical and the campaign did not end."""
+    scenario = analytic(lambda x: np.full(len(x), 3.0), inputs=INPUTS, critical=(-np.inf, 0.0), name="constant")
+    result = sbt.run(
+        campaign="boundary", scenario=scenario, budget=300, seed=1, executor="serial", store=tmp_path / "s", report=False,
+        stop={"misclassified": 0.05},
+    )  # fmt: skip
+    found, n = result.conclusion, len(result.history)
+    assert n < 120
+    assert found.even_fraction.counted > 0.85 * n
+    assert found.even_fraction.high < 0.06
+    assert any(f"that of all {found.even_fraction.counted} runs that fill the space evenly" in line for line in result.sentences())

@@ -12,6 +12,7 @@ import numpy as np
 from sbt.campaigns.choices import ChoiceRule, evenly
 from sbt.campaigns.clustering import clustered_interval
 from sbt.campaigns.combinations import ALL_RUN, all_run, few, without_repetition
+from sbt.campaigns.exploration import space_filling
 from sbt.campaigns.repeats import repeats_wanted
 from sbt.campaigns.settings import Settings
 from sbt.campaigns.sides import all_critical, few_of_a_side, none_critical
@@ -161,7 +162,7 @@ class BatchStage:
 
 def _both_sides_known(log: Log, scenario: LogicalScenario, target: float) -> bool:
     """Return whether several runs tell of each side, or those that fill space bound what is missing by so much of it."""
-    even, facts = log.history.where(np.isin(log.history.stage, ("initial", VALIDATION))), Facts.of(log.history, scenario)
+    even, facts = log.history.where(space_filling(log)), Facts.of(log.history, scenario)
     bounded = (none_critical(facts) or all_critical(facts)) and bool(upper(0, len(even), _SURE) <= target)
     return bounded or not few_of_a_side(facts)
 

@@ -15,6 +15,7 @@ __all__ = ["denial", "ends", "nowhere_likely", "reconciled"]
 
 _HARDLY = 100  # held-out runs, below which their interval is too wide to confirm a share
 _MANY = 1000  # held-out runs, from which on they are as sharp as the metamodel
+_MORE = 2  # times the held-out runs, from which on all even ones tell more
 _VAGUE = 0.5  # of the critical share: expected on the wrong side, from which on no place is known
 
 
@@ -63,10 +64,15 @@ def _by_held_out(found: BoundaryConclusion, runs: CriticalShare, learned: int) -
             return [f"{said}. It lies outside of their interval, but within that of {agree}: run more to tell which is chance."]
         return [f"{said}. The held-out runs deny that: it lies outside of their interval. Trust the runs, and run more."]
     if held_out.counted < _HARDLY:
-        return [f"{said}. So few runs hardly test it: it lies within their interval."]
+        more = "" if every is None or every.counted < _MORE * held_out.counted or not _holds(every, share) else _in_all(every)
+        return [f"{said}. So few runs hardly test it: it lies within their interval{more}."]
     sharper = share and found.critical_range is None and held_out.counted < min(_MANY, learned)
     more = f"; the metamodel's figure, which rests on {plural(learned, 'other run')}, is the sharper one" if sharper else ""
     return [f"{said}. They agree: it lies within that interval{more}."]
+
+
+def _in_all(every: CriticalShare) -> str:
+    return f", and within that of all {plural(every.counted, 'run')} that fill the space evenly, these among them ({ends(every)})"
 
 
 def _unlike_even(found: BoundaryConclusion) -> list[str]:
