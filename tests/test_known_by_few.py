@@ -111,4 +111,5 @@ def test_a_metric_of_one_value_is_known_as_soon_as_runs_that_fill_the_space_boun
     assert n < 120
     assert found.even_fraction.counted > 0.85 * n
     assert found.even_fraction.high < 0.06
-    assert any(f"that of all {found.even_fraction.counted} runs that fill the space evenly" in line for line in result.sentences())
+    said = f"that of all {found.even_fraction.counted} runs that fill the space evenly"
+    assert any(said in line for line in result.sentences())
