@@ -474,3 +474,11 @@ def test_where_every_run_failed_the_first_sentence_says_so(tmp_path):
 )
 def test_a_command_of_a_run_leaves_the_name_of_the_folder_alone(command, expected):
     assert of_run(command, 7) == expected
+
+
+@pytest.mark.parametrize(("ends", "direction"), [((3.0, np.inf), "high"), ((-np.inf, 3.0), "low"), ((0.0, 3.0), "low")])
+def test_which_values_of_a_metric_of_ones_own_are_bad_is_said_by_the_requirement(ends, direction):
+    """Of a count of at least 3, all uncritical runs were "below 3, beyond the critical interval. Is that meant?"."""
+    space = ParameterSpace((Parameter("a", 0.0, 1.0),))
+    scenario = LogicalScenario("own", space, Requirement("count", *ends), evaluate=lambda v, s: {}, metric_names=("count",))
+    assert scenario.direction == direction

@@ -199,8 +199,14 @@ class LogicalScenario:
 
     @property
     def direction(self) -> str:
-        """`low` where small values of the requirement's metric are critical, `high` where large ones are."""
-        return next((m.direction for m in self.metrics if m.name == self.requirement.metric), "low")
+        """`low` where small values of the requirement's metric are bad, `high` where large ones are.
+
+        Of a metric that `evaluate` gives the requirement says so, where M_c has no upper end.
+        """
+        need = self.requirement
+        if self.evaluate is not None and not need.combined and need.critical.one_sided and need.critical.outward < 0.0:
+            return "high"
+        return next((m.direction for m in self.metrics if m.name == need.metric), "low")
 
     @property
     def isolations(self) -> tuple[str, ...]:
