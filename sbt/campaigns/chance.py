@@ -60,15 +60,15 @@ def chance_place(log_odds: LogOdds, scenario: LogicalScenario, seed: int, u: Poi
     at = SobolSequence(space.dimension, seed).admissible(lambda v: space.feasible(space.from_unit(v)), _POINTS, _LEAST)
     if len(at) == 0 or len(u) == 0:
         return None
-    likely, odds = log_odds(u) > 0.0, np.nan_to_num(log_odds(space.cube.snapped(at)), neginf=-700.0, posinf=700.0)
+    own = log_odds(u)
+    likely, p = own > 0.0, expit(np.nan_to_num(log_odds(space.cube.snapped(at)), neginf=-700.0, posinf=700.0))
     if likely.any() and hit[likely].mean() >= 0.5:
         return None
-    p = expit(odds)
     least = _HALF * float(np.quantile(p, _LARGEST))
     if least < _HALF * _UNEVEN * float(p.mean()) or (not likely.any() and bool((p > 0.5).any())):
         return None
     above = np.log(least / (1.0 - least))
-    there = log_odds(u) > above
+    there = own > above
     if hit[there].sum() < _FEWEST or _as_elsewhere(hit, there) > _CHANCE:
         return None
     place = boundary_place(lambda v: log_odds(v) - above, scenario, seed)

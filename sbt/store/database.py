@@ -58,7 +58,7 @@ class Store:
         self.folder = folder
         self._db = connection
         self._lock = lock
-        self._may_hurry, self._waits, self._waited = False, True, -_TOGETHER  # commits may not wait, do, a run last did (clock)
+        self._may_hurry, self._waits, self._waited = False, True, -_TOGETHER  # commits may go on at once, wait, last did (clock)
         self._rows: Rows | None = None  # finished rows before the first unfinished one: they never change
         self._read_up_to = 0  # index of the first row not among them
         self._iterations: list[Iteration] = []
@@ -135,7 +135,7 @@ class Store:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close it."""
+        """Close the file and release the lock."""
         self.close()
 
     def close(self) -> None:
