@@ -27,6 +27,7 @@ from sbt.metrics.longitudinal import (
     ttc_min,
 )
 from sbt.metrics.planar import severity
+from sbt.metrics.rss import Rss, rss_longitudinal_min, rss_violation
 from sbt.problem.trace import ActorTrace, Trace
 
 shapely = pytest.importorskip("shapely", reason="geometry is compared with shapely, which is not installed")
@@ -336,6 +337,33 @@ def test_a_part_in_the_path_behind_the_ego_is_not_beside_it():
     assert not encounter(trace).beside.any()
     assert ttc_min()(trace) == HORIZON
     assert d_min()(trace) == FAR
+
+
+@given(pose, pose, size, size, st.floats(0.0, 1.5))
+@example((0.0, 0.0, 0.0), (-4.99, -2.38, -0.365), 5.0, 1.8, 0.0)  # turns out behind one that stands
+@settings(max_examples=150)
+def test_nobody_is_beside_whose_part_in_the_path_is_behind(one, other, length, width, margin):
+    """What is left of the other in ego's strip, by shapely, tells whether it is there; a corner that turns past it does not."""
+    a, b = box([one, one]), box([other, other], length, width)
+    trace = Trace(
+        np.arange(2.0), ("ego", "co"), *(np.stack([getattr(c, n) for c in (a, b)], axis=1) for n in ("x", "y", "heading")),
+        np.zeros((2, 2)), np.zeros((2, 2)), np.array([LENGTH, length]), np.array([WIDTH, width]),
+    )  # fmt: skip
+    strip = polygon(one, 100.0, WIDTH + 2 * margin)
+    shared = affinity.rotate(polygon(other, length, width).intersection(strip), -one[2], one[:2], use_radians=True)
+    assume(shared.area > 1e-6)
+    front = shared.bounds[2] - one[0]
+    assume(abs(front + 0.5 * LENGTH) > 1e-6)
+    found = encounter(trace, margin=margin)
+    if found.beside[0]:
+        assert front > -0.5 * LENGTH
+    elif not found.ahead[0]:
+        assert front < -0.5 * LENGTH
+    if front < -0.5 * LENGTH:
+        assert ttc_min(margin=margin, passed=HORIZON)(trace) == HORIZON
+        assert d_min(margin=margin, passed=FAR)(trace) == FAR
+        assert rss_longitudinal_min(margin=margin)(trace) == FAR
+        assert rss_violation(rules=Rss(response=0.1, lateral_margin=margin))(trace) == 0.0
 
 
 def _braking(speeds: list[list[float]], gap: float, step: float, *, ballistic: bool = True) -> tuple[Trace, float]:

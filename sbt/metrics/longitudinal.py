@@ -16,6 +16,7 @@ import numpy as np
 
 from sbt.metrics.cache import per_trace
 from sbt.metrics.geometry import contact_index, contact_moment, rectangles
+from sbt.metrics.strips import turned_in_behind
 from sbt.problem.arrays import Mask, Vector
 from sbt.problem.metric import Metric
 from sbt.problem.trace import ActorTrace, Trace
@@ -110,8 +111,10 @@ def _sighting(a: ActorTrace, b: ActorTrace, length: float, margin: float) -> _Si
     reach = b.length * np.abs(turn) + b.width * aside  # along the ego's heading: who stands across is as long as it is wide
     broad = b.length * aside + b.width * np.abs(turn)
     gap = dx * cos + dy * sin - 0.5 * (a.length + reach)
-    offset = np.abs(-dx * sin + dy * cos)
-    return gap, turn, offset < 0.5 * (a.width + broad) + margin, gap <= -(length + reach)
+    in_path = np.abs(-dx * sin + dy * cos) < 0.5 * (a.width + broad) + margin
+    behind = gap <= -(length + reach)
+    beside = in_path & (gap < 0) & ~behind
+    return gap, turn, in_path, behind | turned_in_behind(a, b, length - 0.5 * a.length, margin, beside)
 
 
 def _nearest_in_path(seen: list[_Sighting]) -> _Sighting:

@@ -20,6 +20,7 @@ from sbt.errors import InputError
 from sbt.metrics.exposure import integral
 from sbt.metrics.geometry import part_pairs
 from sbt.metrics.longitudinal import FAR
+from sbt.metrics.strips import turned_in_behind
 from sbt.problem.arrays import Mask, Vector
 from sbt.problem.metric import Metric
 from sbt.problem.trace import ActorTrace, Trace
@@ -131,6 +132,16 @@ def _relation_of(a: ActorTrace, b: ActorTrace) -> _Relation:
     return _Relation(gap, clearance, along >= 0, across >= 0, turn)
 
 
+def _behind(trace: Trace, ego: str, other: str, aside: Vector | float) -> Mask:
+    """Return (t,) whether all of the other in the ego's path, so much wider (m), is behind: no duty is the ego's."""
+    found = np.ones(len(trace.time), dtype=bool)
+    for a, b in part_pairs(trace.actor(ego), trace.actor(other)):
+        r = _relation_of(a, b)
+        clear, level = (r.clearance >= aside) | ((r.gap >= 0) & ~r.ahead), (r.gap < 0) & (r.clearance < aside)
+        found &= clear | turned_in_behind(a, b, 0.5 * a.length, aside, level)
+    return found
+
+
 def longitudinal_margin(trace: Trace, ego: str, other: str, margin: float = 0.0, rules: Rss = DEFAULT) -> Vector:
     """Return the (t,) longitudinal distance minus the safe one (m), at any lateral position; 1,000 where the ego has no duty."""
     r, own = _relation(trace, ego, other), trace.actor(ego).speed
@@ -142,11 +153,15 @@ def longitudinal_margin(trace: Trace, ego: str, other: str, margin: float = 0.0,
     return np.where(assessed, np.minimum(r.gap - safe, FAR), FAR)
 
 
+def _safe_aside(r: _Relation, other: ActorTrace, rules: Rss) -> Vector:
+    leftwards = other.speed * np.sin(r.turn)
+    return rules.sideways(np.zeros(len(leftwards)), np.where(r.left, leftwards, -leftwards))
+
+
 def lateral_margin(trace: Trace, ego: str, other: str, margin: float = 0.0, rules: Rss = DEFAULT) -> Vector:
     """Return the (t,) lateral distance minus the safe one (m), at any longitudinal position; at most 1,000."""
     r = _relation(trace, ego, other)
-    leftwards = trace.actor(other).speed * np.sin(r.turn)
-    safe = rules.sideways(np.zeros(len(trace.time)), np.where(r.left, leftwards, -leftwards))
+    safe = _safe_aside(r, trace.actor(other), rules)
     return np.where(np.abs(np.cos(r.turn)) >= _MIN_COS, np.minimum(r.clearance - safe, FAR), FAR)
 
 
@@ -164,7 +179,7 @@ def rss_longitudinal_min(ego: str = "ego", other: str = "co", margin: float = 0.
     """Return the smallest longitudinal distance minus the safe one while the other is in the ego's path (m)."""
     return _smallest(
         "rss_longitudinal_min", lambda trace: longitudinal_margin(trace, ego, other, rules=rules),
-        lambda trace: _relation(trace, ego, other).clearance < margin,
+        lambda trace: (_relation(trace, ego, other).clearance < margin) & ~_behind(trace, ego, other, margin),
         "smallest gap less the safe longitudinal distance of RSS, while the other is in the ego's path",
     )  # fmt: skip
 
@@ -184,6 +199,9 @@ def rss_violation(ego: str = "ego", other: str = "co", rules: Rss = DEFAULT) -> 
     def function(trace: Trace) -> float:
         longitudinal = longitudinal_margin(trace, ego, other, rules=rules)
         dangerous = (longitudinal < 0) & (lateral_margin(trace, ego, other, rules=rules) < 0)
+        if dangerous.any():
+            safe = _safe_aside(_relation(trace, ego, other), trace.actor(other), rules)
+            dangerous &= ~_behind(trace, ego, other, safe)
         return integral(trace, dangerous, ego, other)
 
     return Metric(
