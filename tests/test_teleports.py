@@ -155,3 +155,66 @@ def test_a_change_of_lanes_within_the_shortest_step_is_no_teleport(tmp_path: Pat
     assert np.abs(np.diff(y)).max() > 3.0
     assert not np.isnan(y).any()
     assert not trace.unconfirmed
+
+
+CROSSING = (
+    '<nodes><node id="a" x="0" y="0"/><node id="b" x="100" y="0"/><node id="c" x="300" y="0"/><node id="s" x="100" y="-100"/>'
+    '<node id="n" x="100" y="100"/></nodes>'
+)
+ROADS = (
+    '<edges><edge id="ab" from="a" to="b" numLanes="2"/><edge id="bc" from="b" to="c" numLanes="2"/>'
+    '<edge id="sb" from="s" to="b" numLanes="1"/><edge id="bn" from="b" to="n" numLanes="1"/></edges>'
+)
+OVER = """<routes><vType id="t" tau="${{tau}}"/><vehicle id="ego" type="t" depart="0" departPos="{at}" departSpeed="8" departLane="0">
+<route edges="{ego}"/></vehicle><vehicle id="g" type="t" depart="0" departPos="{other}" departSpeed="8"><route edges="ab bc"/></vehicle></routes>
+"""
+
+
+def _over(folder: Path, step: float, make: str, run: str, **where: str) -> sbt.Scenario:
+    (folder / "n.nod.xml").write_text(CROSSING)
+    (folder / "e.edg.xml").write_text(ROADS)
+    run_program(folder, "netconvert", "-n", "n.nod.xml", "-e", "e.edg.xml", "-o", "net.net.xml", "--no-internal-links", make)
+    (folder / "my.rou.xml").write_text(OVER.format(**where))
+    (folder / "my.sumocfg").write_text(
+        '<configuration><net-file value="net.net.xml"/><route-files value="my.rou.xml"/>'
+        f'<step-length value="{step}"/><no-internal-links value="{run}"/></configuration>'
+    )
+    (folder / "scenario.yaml").write_text(YAML.replace("duration: 25", "duration: 5"))
+    return ScenarioSpec(str(folder / "scenario.yaml")).resolve()
+
+
+@pytest.mark.parametrize(("step", "make", "run"), [(0.05, "true", "false"), (1.0, "true", "false"), (0.5, "false", "true")])
+def test_nobody_drives_over_a_junction_without_lanes(tmp_path: Path, step: float, make: str, run: str):
+    """Some 10 m within a step were motion below 150 m/s: all critical runs of a campaign were contacts of such an ego."""
+    for route in ("ab bc", "sb bc"):
+        (folder := tmp_path / route).mkdir()
+        scenario = _over(folder, step, make, run, ego=route, at="70", other="5")
+        outcome = run_job(scenario, Job(0, {"tau": 1.0}, 1))
+        assert outcome.status == "invalid"
+        assert "no lanes inside junctions: make it, and run SUMO, without no-internal-links" in outcome.reason
+    scenario = _over(tmp_path, step, make, run, ego="sb", at="5", other="70")
+    outcome = run_job(scenario, Job(0, {"tau": 1.0}, 1))
+    assert outcome.status == "ok"
+    assert doubts(outcome.unconfirmed) == (Doubt.CROSSED,)
+    assert np.isnan(scenario.simulate({"tau": 1.0}, 1).actor("g").x).sum() == 1, "the one instant at which it was put there"
+    assert any("no lanes inside junctions" in said for said in scenario.simulate.warnings())
+    result = sbt.run(campaign="coverage", scenario=scenario, budget=2, store=tmp_path / "s", executor="serial", report=False)
+    said = " ".join(result.sentences())
+    assert "In 2 of 2 runs a road user near the ego was moved over a junction within a step" in said
+    assert "time-to-teleport" not in said
+
+
+@pytest.mark.parametrize("step", [0.05, 1.0])
+def test_a_road_that_goes_on_without_a_gap_needs_no_lanes_inside_its_junction(tmp_path: Path, step: float):
+    _over(tmp_path, step, "true", "false", ego="ab bc", at="60", other="5")
+    (tmp_path / "e.edg.xml").write_text(ROADS.partition('<edge id="sb"')[0] + "</edges>")
+    run_program(tmp_path, "netconvert", "-n", "n.nod.xml", "-e", "e.edg.xml", "-o", "net.net.xml", "--no-internal-links", "true")
+    (tmp_path / "mine.py").write_text(LOOP)
+    yaml = (tmp_path / "scenario.yaml").read_text()
+    (tmp_path / "with.yaml").write_text(yaml.replace("sumo: my.sumocfg", "sumo: my.sumocfg\nsimulate: mine.py:simulate"))
+    scenario = ScenarioSpec(str(tmp_path / "with.yaml")).resolve()
+    outcome = run_job(scenario, Job(0, {"tau": 1.0}, 1))
+    assert (outcome.status, outcome.unconfirmed) == ("ok", "")
+    ego = scenario.simulate({"tau": 1.0}, 1).actor("ego")
+    assert np.ptp(ego.y) > 2.0, "it has changed lanes"
+    assert ego.x[-1] > 110.0

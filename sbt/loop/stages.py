@@ -139,6 +139,10 @@ def sentences_of(conclusion: Conclusion, facts: Facts) -> list[str]:
     if said and moved:
         which = f"In {moved:,} of {len(facts.history):,} runs a road user near the ego was teleported"
         said = [*said, f"{which}: metrics see it leave and come, not move (column unconfirmed; SUMO's time-to-teleport)."]
+    crossed = int(facts.history.doubtful(Doubt.CROSSED).sum())
+    if said and crossed:
+        which = f"In {crossed:,} of {len(facts.history):,} runs a road user near the ego was moved over a junction within a step"
+        said = [*said, f"{which}: metrics see it leave and come (column unconfirmed; the network has no lanes inside junctions)."]
     dead = int(facts.history.doubtful(Doubt.STOPPED).sum())
     if said and dead:
         which = f"In {dead:,} of {len(facts.history):,} runs another road user brakes as no vehicle can"

@@ -9,8 +9,8 @@ from enum import StrEnum
 from sbt.problem.plain import Values
 
 __all__ = [
-    "IMPOSSIBLE", "LISTED_ONLY", "OTHER_LEVEL", "STOPPED", "STRUCK", "TELEPORTED", "UNCONFIRMED", "Doubt", "Job", "Outcome",
-    "Status", "doubts",
+    "CROSSED", "IMPOSSIBLE", "LISTED_ONLY", "OTHER_LEVEL", "STOPPED", "STRUCK", "TELEPORTED", "UNCONFIRMED", "Doubt", "Job",
+    "Outcome", "Status", "doubts",
 ]  # fmt: skip
 
 UNCONFIRMED, LISTED_ONLY = "contact with ", "listed with "
@@ -19,8 +19,8 @@ STRUCK, OTHER_LEVEL = "hit from behind by ", "on another level: "
 """How the text begins of a contact with a recorded road user from behind, and of one on a road taken for a bridge."""
 IMPOSSIBLE, STOPPED = "as no vehicle can: ", "stopped dead: "
 """How the text begins of a motion of the ego, and of another, that no tyre holds: commanded, or done by SUMO."""
-TELEPORTED = "teleported: "
-"""How the text begins of a road user near the ego that was moved to another place."""
+TELEPORTED, CROSSED = "teleported: ", "moved over a junction: "
+"""How the text begins of a road user near the ego that was moved to another place, and of one over a junction without lanes."""
 
 
 class Doubt(StrEnum):
@@ -38,13 +38,15 @@ class Doubt(StrEnum):
     """it accelerates or brakes by more than tyres hold"""
     TELEPORTED = "somebody near the ego was teleported"
     """a road user was moved to another place, such as by SUMO out of a jam"""
+    CROSSED = "somebody near the ego was moved over a junction"
+    """within a step, as the network has no lanes inside junctions"""
     STOPPED = "another road user was stopped dead"
     """a road user brakes by more than tyres hold, such as SUMO lets one before a red light or where its lane ends"""
 
 
 _BEGINNINGS = {
     UNCONFIRMED: Doubt.UNCONFIRMED, LISTED_ONLY: Doubt.LISTED_ONLY, STRUCK: Doubt.STRUCK, OTHER_LEVEL: Doubt.OTHER_LEVEL,
-    IMPOSSIBLE: Doubt.IMPOSSIBLE, TELEPORTED: Doubt.TELEPORTED, STOPPED: Doubt.STOPPED,
+    IMPOSSIBLE: Doubt.IMPOSSIBLE, TELEPORTED: Doubt.TELEPORTED, CROSSED: Doubt.CROSSED, STOPPED: Doubt.STOPPED,
 }  # fmt: skip
 
 

@@ -10,7 +10,7 @@ from sbt.problem.outcome import Status
 from sbt.sumo.actors import State
 from sbt.sumo.levels import is_known
 
-__all__ = ["check_sizes", "refuse_twice", "why_jumped"]
+__all__ = ["check_sizes", "refuse_twice"]
 
 _ALIKE = 0.01
 """Difference of two lengths or widths that are one (m)."""
@@ -23,13 +23,6 @@ def refuse_twice(name: str) -> None:
         RunError: always.
     """
     raise RunError(Status.INVALID, f"no person may have the id of a vehicle, but there are both of '{name}': give persons others")
-
-
-def why_jumped(sumo: Any) -> str:
-    """Return why an ego may be moved over a junction within a step, and what to do, as the end of a message; "" elsewhere."""
-    if any(edge.startswith(":") for edge in sumo.edge.getIDList()):
-        return ""
-    return ", as the network has no lanes inside junctions: make it, and run SUMO, without no-internal-links"
 
 
 def check_sizes(sumo: Any, states: Mapping[str, State], names: Iterable[str]) -> None:

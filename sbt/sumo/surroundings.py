@@ -22,7 +22,8 @@ from sbt.problem.trace import ActorTrace, States, Trace
 from sbt.sumo.actors import State
 from sbt.sumo.ego_level import EgoLevel
 from sbt.sumo.guided import Placed
-from sbt.sumo.identity import check_sizes, refuse_twice, why_jumped
+from sbt.sumo.identity import check_sizes, refuse_twice
+from sbt.sumo.junctions import Junctions
 from sbt.sumo.lanes_behind import Lanes, path_behind
 from sbt.sumo.levels import is_known
 from sbt.sumo.nearby import Nearby
@@ -31,13 +32,15 @@ from sbt.sumo.overlaps import Rectangle, separate
 from sbt.sumo.session import INVALID_DOUBLE, is_ballistic
 from sbt.sumo.teleports import Teleports
 from sbt.sumo.trailing import LONGEST_RIGID, TrailingBody, part_traces
-from sbt.sumo.ways import LEFT_THE_ROAD, line_ahead, rectangle_ways
+from sbt.sumo.ways import LEFT_THE_ROAD, line_ahead, line_behind, rectangle_ways
 
 __all__ = ["Surroundings"]
 
 _BESIDE = 0.5
 """How far who parks, or leaves its place, is moved beside what it drives, from which on it has jumped there (m)."""
 
+_FREE = 1.0
+"""Moves within a step up to so far are not looked at (m)."""
 _SIZED = 1.0
 """After how much simulated time sizes are looked at (s)."""
 
@@ -79,7 +82,7 @@ class Surroundings:
         self.placed: Mapping[str, Placed] = {}
         self.jumped: set[str] = set()
         self._farthest, self._recorded_at = float(farthest(dt)), 0.0
-        self._teleports = Teleports(sumo.simulation)
+        self._teleports, self._junctions = Teleports(sumo.simulation, ego), Junctions(sumo)
         self._parking: Sequence[str] = ()
         self._left: Sequence[str] = ()
         self._leaving: Sequence[str] = ()
@@ -195,12 +198,10 @@ class Surroundings:
         moved = math.dist(now, (state.x + 0.5 * state.length * state.cos, state.y + 0.5 * state.length * state.sin))
         elapsed = max(self._sumo.simulation.getTime() - self._recorded_at, self._dt)  # a run is judged after its last instant
         if now[0] != INVALID_DOUBLE and moved > float(farthest(elapsed)):
-            self._note_jump(name, moved)
+            self._note_jump(name, moved, crossed=self._junctions.explain(name, moved, state.speed * elapsed))
             return
         ahead, poses = line_ahead(self._sumo, name), self._poses(name, len(self._rows) - 1)
-        size = state.length / len(poses)
-        reach = 0.5 * size * np.stack([np.cos(poses[::-1, 2]), np.sin(poses[::-1, 2])], axis=1)
-        behind = np.vstack([poses[::-1, :2] - reach, poses[:1, :2] + reach[-1]])
+        size, behind = state.length / len(poses), line_behind(poses, state.length)
         if ahead is not None and (ways := rectangle_ways(behind, ahead, state.length)):
             parts = [k * size for k in range(len(poses))] if name in self._parts[-1] else []
             self._ways[name] = (*ways, *rectangle_ways(behind, ahead, size, parts))
@@ -235,10 +236,9 @@ class Surroundings:
         moved = 0.0 if last is None else math.hypot(state.x - last[0], state.y - last[1])
         if last is not None and half and moved > self._farthest:  # SUMO turns a long vehicle at once: where was its front?
             moved = min(moved, math.hypot(x - last[0] - half * math.cos(last[2]), y - last[1] - half * math.sin(last[2])))
-        parks = last is not None and name in self._parking and moved > (last[3] + speed) * self._dt + _BESIDE
-        put = last is not None and name in self._put and moved > (last[3] + speed) * self._dt + LANE_CHANGE
-        if moved > self._farthest or put or (last is not None and name in self._teleports.ending):
-            self._note_jump(name, moved)
+        driven = 0.0 if last is None else (last[3] + speed) * self._dt
+        parks = name in self._parking and moved > driven + _BESIDE
+        if last is not None and (moved > _FREE or self._teleports.ending) and self._jumps(name, last, (x, y), moved, speed):
             return
         if parks and name != self._ego and (name not in self._left or self._is_far(state, moved)):
             self.jumped.add(name)
@@ -257,19 +257,26 @@ class Surroundings:
             lane = self._sumo.vehicle.getLaneID(name)
             parts[name] = self._bodies[name].move((x, y), state.cos, state.sin, lane, speed * self._dt)
 
+    def _jumps(self, name: str, last: _Row, front: tuple[float, float], moved: float, speed: float) -> bool:
+        """Return, and note, whether one was moved to another place, so far (m)."""
+        put = name in self._teleports.ending or (name in self._put and moved > (last[3] + speed) * self._dt + LANE_CHANGE)
+        crossed = False
+        if not put and name not in self.rigid and name not in self._parking:
+            heading, driven = self.states[name].heading, max(last[3], speed) * self._dt
+            crossed = self._junctions.jumped(name, last, front, heading, self._centre_offsets[name], driven)
+        if jumps := put or crossed or moved > self._farthest:
+            self._note_jump(name, moved, crossed=crossed)
+        return jumps
+
     def _is_far(self, state: State, moved: float) -> bool:
         """Return whether nobody who has just been moved so far (m) can have touched the ego meanwhile."""
         own = self.states[self._ego]
         return math.hypot(state.x - own.x, state.y - own.y) > own.length + state.length + moved
 
-    def _note_jump(self, name: str, moved: float) -> None:
-        """Leave out a road user that was moved to another place; the ego must not be."""
-        t = len(self._rows) * self._dt  # of the row that is being made
-        if name == self._ego:
-            how = f"was moved by {moved:.0f} m within a step at {t:.3f} s{why_jumped(self._sumo)}"
-            raise RunError(Status.INVALID, f"the ego '{name}' must stay on its way, but {how}")
+    def _note_jump(self, name: str, moved: float, *, crossed: bool) -> None:
+        """Leave out a road user that was moved to another place, or over a junction; the ego must not be."""
+        self._teleports.jump(name, len(self._rows) * self._dt, moved, crossed=crossed)  # t of the row that is being made
         self.jumped.add(name)
-        self._teleports.jump(name, t, moved)
 
     def _first_seen(self, name: str, variables: Mapping[int, Any]) -> State:
         person = VEHICLE in variables

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from typing import Any
 
-from sbt.problem.outcome import TELEPORTED
+from sbt.errors import RunError
+from sbt.problem.outcome import CROSSED, TELEPORTED, Status
+from sbt.sumo.junctions import WHY_JUMPED
 
 __all__ = ["Teleports"]
 
@@ -15,13 +17,14 @@ class Teleports:
 
     Args:
         simulation: of libsumo or traci.
+        ego: id of the vehicle under test, which must not be moved.
 
     Attributes:
         ending: whom SUMO puts to another place in this step.
     """
 
-    def __init__(self, simulation: Any):
-        self._simulation = simulation
+    def __init__(self, simulation: Any, ego: str = ""):
+        self._simulation, self._ego = simulation, ego
         self._begun: Sequence[str] = ()
         self.ending: Sequence[str] = ()
         self._notes: dict[str, str] = {}
@@ -37,9 +40,16 @@ class Teleports:
         self._begun = of.getStartingTeleportIDList() if of.getStartingTeleportNumber() else ()
         self.ending = of.getEndingTeleportIDList() if of.getEndingTeleportNumber() else ()
 
-    def jump(self, name: str, t: float, moved: float) -> None:
-        """Note one who was moved that far (m) within the step to t (s)."""
-        self._note(name, t, f"it was moved by {moved:.0f} m, and its track is interrupted")
+    def jump(self, name: str, t: float, moved: float, *, crossed: bool = False) -> None:
+        """Note one who was moved that far (m) within the step to t (s); crossed: over a junction without lanes inside.
+
+        Raises:
+            RunError: it is the ego.
+        """
+        if name == self._ego:
+            how = f"was moved by {moved:.0f} m within a step at {t:.3f} s{WHY_JUMPED if crossed else ''}"
+            raise RunError(Status.INVALID, f"the ego '{name}' must stay on its way, but {how}")
+        self._note(name, t, f"it was moved by {moved:.0f} m, and its track is interrupted", CROSSED if crossed else TELEPORTED)
 
     def compare(self, before: Collection[str], now: Collection[str], t: float) -> None:
         """Note whom SUMO has taken off the road next to the ego, or put there: those recorded before and now, at t (s)."""
@@ -50,5 +60,5 @@ class Teleports:
             if name in now and name not in before:
                 self._note(name, t, "SUMO put it there")
 
-    def _note(self, name: str, t: float, what: str) -> None:
-        self._notes.setdefault(name, f"{TELEPORTED}'{name}' at {t:.3f} s: {what}")
+    def _note(self, name: str, t: float, what: str, how: str = TELEPORTED) -> None:
+        self._notes.setdefault(name, f"{how}'{name}' at {t:.3f} s: {what}")

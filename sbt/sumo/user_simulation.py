@@ -41,6 +41,7 @@ from sbt.sumo.forking import in_fork
 from sbt.sumo.formatting import plain_values
 from sbt.sumo.friction import Friction
 from sbt.sumo.guided import GuidedVehicle, Participant
+from sbt.sumo.junctions import told_of_junctions
 from sbt.sumo.lane_lengths import told_of_lengths
 from sbt.sumo.levels import levels_of
 from sbt.sumo.messages import explained, refuse_dropped
@@ -56,10 +57,8 @@ __all__ = ["Covariates", "Loop", "TraciProxy", "UserSimulation", "step_until_ove
 
 WARM_UPS = 8
 """Warm-ups of a scenario that states no number, outside campaigns."""
-_LONGEST_STEP = 1000.0
-"""Longest step (s)."""
-_GRACE = 1.0
-"""Time by which a run may exceed its limit before its process is ended (s): most runs stop themselves."""
+_LONGEST_STEP, _GRACE = 1000.0, 1.0
+"""Longest step, and time by which a run may exceed its limit before its process is ended (s): most runs stop themselves."""
 Connect = Callable[[SumoFiles, Values], AbstractContextManager[Any]]
 """Starts SUMO with the files of a run and provides its client module: libsumo or traci."""
 
@@ -315,7 +314,7 @@ class UserSimulation:
         """Return SUMO's warnings about the files in the last run of this process, each once, and what is known beside them."""
         lines = (line for line in session().messages() if line.startswith(("Warning:", "Error:")))
         found = dict.fromkeys(line for line in lines if "time=" not in line)  # with a time it is about the traffic
-        of_net = (session().ask(each) for each in (lambda sumo: levels_of(sumo).warning, told_of_lengths))
+        of_net = (session().ask(each) for each in (lambda sumo: levels_of(sumo).warning, told_of_junctions, told_of_lengths))
         return (*filter(None, [unrepeatable(self.files), *of_net]), *found)
 
     def run_with_traci(self, values: Values, seed: int, traci: Any, program: Sequence[str] = ("sumo-gui",)) -> Trace:

@@ -9,7 +9,7 @@ import numpy as np
 
 from sbt.problem.trace import States
 
-__all__ = ["LEFT_THE_ROAD", "line_ahead", "rectangle_ways"]
+__all__ = ["LEFT_THE_ROAD", "line_ahead", "line_behind", "rectangle_ways"]
 
 LEFT_THE_ROAD: States = np.full((1, 3), np.nan)
 """The way of a vehicle that has arrived: there is none."""
@@ -99,6 +99,12 @@ def _links_to(lane: Any, here: str, edge: str, kind: str) -> list[Any]:
     """Return the links from a lane to those of an edge that a vehicle class may use."""
     links = [link for link in lane.getLinks(here) if link[0].rpartition("_")[0] == edge]
     return [link for link in links if not (allowed := lane.getAllowed(link[0])) or kind in allowed]
+
+
+def line_behind(poses: States, length: float) -> States:
+    """Return the points of a vehicle from its rear to its front, of the (n, 3) poses of its parts, the front one first."""
+    reach = 0.5 * length / len(poses) * np.stack([np.cos(poses[::-1, 2]), np.sin(poses[::-1, 2])], axis=1)
+    return np.vstack([poses[::-1, :2] - reach, poses[:1, :2] + reach[-1]])
 
 
 def rectangle_ways(behind: States, ahead: States, length: float, offsets: Sequence[float] = (0.0,)) -> list[States]:
