@@ -122,6 +122,7 @@ class DepartureMonitor:
 
     Attributes:
         asked: all vehicles whose departures were requested.
+        arrival: arrivalPos and arrivalEdge of an ego of the files; None: it is added otherwise.
     """
 
     def __init__(
@@ -130,7 +131,9 @@ class DepartureMonitor:
     ):  # fmt: skip
         self._sumo, self._ego, self._files, self._values = sumo, ego, files, values
         self._start = float(sumo.simulation.getTime())
-        self._in_files = files.vehicle(ego.id) is not None or person(files.templates, ego.id) is not None
+        of_ego = files.vehicle(ego.id)
+        self._in_files = of_ego is not None or person(files.templates, ego.id) is not None
+        self.arrival = None if of_ego is None else (of_ego[0].arrival or "max", of_ego[0].arrival_edge)
         self._requested: dict[str, RequestedDeparture] = {}
         self._due: list[tuple[float, str]] = []
         self._places: dict[str, str] = {}

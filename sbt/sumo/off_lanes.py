@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from typing import Any
 
 from sbt.errors import RunError
 from sbt.problem.outcome import Status
 from sbt.sumo.guided import Placed
+from sbt.sumo.leaving import why_gone
 from sbt.sumo.levels import is_known
 from sbt.sumo.session import INVALID_DOUBLE
 
@@ -23,7 +24,9 @@ def read(sumo: Any, vehicle: str) -> dict[int, Any]:
     return {POSITION: of.getPosition3D(vehicle), ANGLE: of.getAngle(vehicle), SPEED: of.getSpeed(vehicle)}
 
 
-def off_lanes(sumo: Any, ego: str, near: Mapping[str, Any], unseen: Iterable[str]) -> dict[str, dict[int, Any]]:
+def off_lanes(
+    sumo: Any, ego: str, near: Mapping[str, Any], unseen: Iterable[str], rigid: Container[str]
+) -> dict[str, dict[int, Any]]:  # fmt: skip
     """Return the variables of those who are on no lane, the ego among them, near or far. Who parks is beside the road.
 
     Args:
@@ -31,6 +34,7 @@ def off_lanes(sumo: Any, ego: str, near: Mapping[str, Any], unseen: Iterable[str
         ego: id.
         near: whom the ego's subscription sees, on lanes.
         unseen: who was there before, or was moved by poses, and is not among them.
+        rigid: who was moved by poses.
 
     Raises:
         RunError: the ego is not there.
@@ -38,9 +42,9 @@ def off_lanes(sumo: Any, ego: str, near: Mapping[str, Any], unseen: Iterable[str
     found = {name: read(sumo, name) for name in unseen if is_known(sumo, name) and _on_no_lane(sumo, name)}
     found = {name: one for name, one in found.items() if one[POSITION][0] != INVALID_DOUBLE}
     if ego not in near and ego not in found:
-        when = f"was gone at t = {sumo.simulation.getTime():g} s"
-        moved = ": off the lanes SUMO keeps only whom the loop moves (moveToXY) in every step" if is_known(sumo, ego) else ""
-        raise RunError(Status.FAILED, f"the ego '{ego}' must stay on the road, but it {when}{moved}")
+        status, moved = (Status.FAILED, True) if ego in rigid else (Status.INVALID, False)
+        when = f"was gone at t = {sumo.simulation.getTime():g} s: {why_gone(sumo, moved=moved)}"
+        raise RunError(status, f"the ego '{ego}' must stay on the road, but it {when}")
     return found
 
 

@@ -29,6 +29,7 @@ from sbt.sumo.departures import DepartureMonitor, RequestedDeparture
 from sbt.sumo.ego import Ego
 from sbt.sumo.ego_vehicle import EgoControl, EgoVehicle
 from sbt.sumo.guided import Placed
+from sbt.sumo.leaving import Leaving
 from sbt.sumo.surroundings import Surroundings
 
 __all__ = ["Recorder", "RecordingSettings", "RunEnded"]
@@ -118,6 +119,7 @@ class Recorder:
         self._ego = settings.ego.id
         self._rng = rng
         self._departures = departures
+        self._leaving = Leaving(sumo, self._ego, departures.arrival)
         self._appearances = AppearanceMonitor(sumo, self._ego, departures)
         self._departed = False
         self._walks: bool | None = None
@@ -202,10 +204,10 @@ class Recorder:
                 self._departures.await_ego()
                 return
             self._start_recording()
-        elif self._ego in arrived:
-            self._handle_arrival()
         if simulation.getStartingTeleportNumber() and self._ego in simulation.getStartingTeleportIDList():
             raise RunError(Status.INVALID, f"the ego '{self._ego}' must stay on its way, but SUMO teleported it at {self._now()}")
+        if self._ego in arrived and len(self._surroundings):
+            self._handle_arrival()
         self._record_step(departed)
 
     def _with_ego_on_foot(self, departed: frozenset[str], arrived: frozenset[str]) -> tuple[frozenset[str], frozenset[str]]:
@@ -243,6 +245,11 @@ class Recorder:
         self._control = self._settings.ego.take_over(self._sumo, self._rng, walks=self._walks is True)
 
     def _handle_arrival(self) -> None:
+        near = self._surroundings
+        if not self._walks and self._ego not in near.rigid:
+            removed = self._leaving.why_removed(near.states[self._ego].speed, self._dt)
+            if removed:
+                raise RunError(Status.INVALID, f"the ego '{self._ego}' must stay on its way, but at {self._now()} {removed}")
         if self._settings.ego.may_leave:
             self._end("left")
         rule = f"the ego '{self._ego}' must stay for the duration of {self._settings.duration:g} s"
@@ -253,6 +260,8 @@ class Recorder:
         """Record the states, SUMO's list of collisions, and contacts; end the run at a contact of the ego."""
         near = self._surroundings
         near.record()
+        if not self._walks and self._ego not in near.rigid:
+            self._leaving.look()
         self._appearances.after_step(near, departed)
         touched = near.touching()
         if self._sumo.simulation.getCollidingVehiclesNumber():

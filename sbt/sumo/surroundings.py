@@ -141,7 +141,7 @@ class Surroundings:
         """
         ego, near = self._ego, self._nearby.subscribed()
         unseen = {ego, *self.rigid, *self.present} - near.keys() - self.placed.keys()
-        off = off_lanes(self._sumo, ego, near, unseen) if unseen else {}
+        off = off_lanes(self._sumo, ego, near, unseen, self.rigid) if unseen else {}
         self._nearby.around(near.get(ego) or off[ego])
         off = {name: variables for name, variables in off.items() if self._nearby.is_near(name, variables)}
         near = {**{name: one for name, one in near.items() if self._nearby.is_near(name, one)}, **off}

@@ -75,7 +75,7 @@ class _Part:
 
 
 class Vehicle(NamedTuple):
-    """Departure attributes of a vehicle, trip or flow as text; None for those that are not given.
+    """Departure attributes, and those of the arrival, of a vehicle, trip or flow as text; None for those that are not given.
 
     `place` is its line and column, `varies` whether any of its attributes contains a placeholder.
     """
@@ -88,6 +88,8 @@ class Vehicle(NamedTuple):
     speed: str | None
     lane: str | None
     begin: str | None
+    arrival: str | None
+    arrival_edge: str | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,8 +280,8 @@ def template(path: Path) -> Template:
         if tag in _VEHICLES and "id" in attributes:
             at = (parser.CurrentLineNumber, parser.CurrentColumnNumber + 1)
             varies = has_parts and any("${" in value for value in attributes.values())
-            departure = map(attributes.get, ("depart", "departPos", "departSpeed", "departLane", "begin"))
-            vehicles[attributes["id"]] = Vehicle(tag, at, varies, *departure)
+            asked = ("depart", "departPos", "departSpeed", "departLane", "begin", "arrivalPos", "arrivalEdge")
+            vehicles[attributes["id"]] = Vehicle(tag, at, varies, *map(attributes.get, asked))
         elif tag in _PERSONS and "id" in attributes:
             persons[attributes["id"]] = (parser.CurrentLineNumber, parser.CurrentColumnNumber + 1)
         if not has_parts:
