@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import re
 import shutil
 import subprocess
 import sys
@@ -493,6 +494,62 @@ def test_manoeuvres_that_states_do_not_hold_are_not_warmed_up(tmp_path):
     net = tmp_path / "opposite" / "town.net.xml"
     net.write_text(net.read_text().replace("</net>", "<!-- <neigh lane='B1A1_1'/> --></net>"))
     assert "overtakes on an opposite lane" in simulation(path).isolation.why
+
+
+NINE = 'depart="9" from="A1B1" to="C1D1"'
+UNSAVED = {  # traffic of the warm-up, or options; what is said
+    "glosa of a type": (
+        f'<vType id="g"><param key="has.glosa.device" value="true"/></vType><trip id="x" type="g" {NINE}/>',
+        r"stops.add.xml:3:\d+: .* \(glosa\)",
+    ),
+    "glosa of a vehicle": (
+        f'<trip id="x" {NINE}><param key="device.glosa.probability" value=".5"/></trip>',
+        r"stops.add.xml:3:\d+: .* \(glosa\)",
+    ),
+    "glosa of all": ("device.glosa.probability: 0.3", r"device for green lights .* option device\.glosa\.probability"),
+    "glosa of one": ("device.glosa.explicit: t1", r"device for green lights .* option device\.glosa\.explicit"),
+    "blue light in a distribution": (
+        '<vTypeDistribution id="d"><vType id="a"><param key="has.bluelight.device" value="true"/></vType></vTypeDistribution>'
+        '<flow id="x" type="d" begin="9" number="2" period="9" from="A1B1" to="C1D1"/>',
+        r"stops.add.xml:3:\d+: .* who makes way for a blue light",
+    ),
+    "errors of drivers": ("device.driverstate.probability: 1", "errors of drivers"),
+    "bluetooth": ("device.btreceiver.probability: 0.1", "cannot load a state of vehicles that have a device for Bluetooth"),
+    "red": (f'<vType id="c" jmDriveAfterRedTime="2"/><trip id="x" type="c" {NINE}/>', "would at once"),
+    "start": (f'<vType id="c" startupDelay="1.5"/><trip id="x" type="c" {NINE}/>', "would start at once"),
+}
+
+
+@pytest.mark.parametrize("what", UNSAVED)
+def test_memories_that_states_do_not_hold_are_not_warmed_up(tmp_path, what):
+    """SUMO: whom GLOSA had slowed down crept for ever; rescue lanes stayed; four cars of a queue ran the red at t0."""
+    given, said = UNSAVED[what]
+    change = {"more": given} if given.startswith("<") else {"options": given}
+    with pytest.raises(InputError, match=said):
+        simulation(town(tmp_path, warm_up="warm_up: {until: 42}", **change)).isolation.warm  # noqa: B018
+    found = simulation(town(tmp_path / "auto", depart="130", warm_up="", **change)).isolation
+    assert (found.level, bool(re.search(said, found.why))) == ("fresh", True)
+
+
+def test_trains_and_level_crossings_are_not_warmed_up_together(tmp_path):
+    """SUMO: a closed crossing was yellow for 5 s more at t0, with the train on it."""
+    train = f'<vType id="r" vClass="rail_urban"/><trip id="x" type="r" {NINE}/>'
+    assert simulation(town(tmp_path / "none", warm_up="", depart="130", more=train)).isolation.level == "snapshot"
+    path, net = town(tmp_path, warm_up="", depart="130", more=train), tmp_path / "town.net.xml"
+    net.write_text(net.read_text().replace("</net>", '<!-- <junction type="rail_crossing"/> --></net>'))
+    assert "level crossings" in simulation(path).isolation.why
+
+
+def test_memories_of_who_departs_later_are_no_obstacle(tmp_path):
+    """The ego alone is an ambulance; types that nobody has, and values that mean nothing, are none either."""
+    unused = '<vType id="u" startupDelay="1"/><vType id="v" startupDelay="0" jmDriveAfterRedTime="-1"/>'
+    path = town(tmp_path, more=f'{unused}<trip id="x" type="v" depart="9" from="A1B1" to="C1D1"/>')
+    ego = tmp_path / "ego.rou.xml"
+    blue = '<param key="has.bluelight.device" value="true"/>'
+    ego.write_text(ego.read_text().replace('accel="${accel}"/>', f'accel="${{accel}}">{blue}</vType>'))
+    assert simulation(path).isolation.level == "snapshot"
+    if shutil.which("netgenerate"):
+        assert simulation(path)(CENTRE, 4).identical(alone(str(path), CENTRE, 4))
 
 
 @pytest.mark.sumo

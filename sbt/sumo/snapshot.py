@@ -10,7 +10,6 @@ from __future__ import annotations
 import itertools
 import math
 import os
-import re
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,15 +19,15 @@ from pathlib import Path
 import numpy as np
 
 from sbt.errors import InputError, RunError
-from sbt.plugins import kept
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.outcome import Status
 from sbt.problem.plain import Values
 from sbt.problem.space import ParameterSpace
 from sbt.seeds import stream
-from sbt.sumo.demand import Piece, expected_departures, pieces_of, seconds_of, texts_of
+from sbt.sumo.demand import Piece, expected_departures, pieces_of, seconds_of
 from sbt.sumo.files import SumoFiles
-from sbt.sumo.template import Template, placeholders
+from sbt.sumo.template import placeholders, template
+from sbt.sumo.unsaved import lost_by_option, lost_in_file, lost_in_traffic
 
 __all__ = ["CAN_FORK", "NoSnapshot", "Snapshot", "WarmUp", "reads_whole", "snapshot_of"]
 
@@ -49,22 +48,6 @@ _STANDING = frozenset((
     "edgeData", "laneData", "routeProbe", "vTypeProbe", "tlLogic", "poly", "poi", "taz", "tazs", "location", "param", "access",
 ))  # fmt: skip
 """Elements that have no events of their own, or whose state SUMO saves. Rerouters, calibrators and the like begin anew."""
-_FORBIDDEN = {
-    "load-state": "", "mesosim": "false", "threads": "1", "device.rerouting.threads": "0", "pedestrian.model": "striping",
-}  # fmt: skip
-"""Options with the one value that a snapshot takes; "": none."""
-
-
-_TAKE_OVER = "SUMO cannot load a state of vehicles that have a device for taking over (toc)"
-_HOW_IT_WALKS = re.compile(rb"<(walk|personTrip)\b[^>]*\b(speed|duration)=")
-_NOT_SAVED = {
-    b"parkingBadges": "a saved state does not hold the parking badges of vehicle types",
-    b"has.toc.device": _TAKE_OVER,
-    b'type="NEMA"': "a saved state does not hold where traffic lights of type NEMA are",
-    b"<neigh ": "SUMO cannot load a state in which somebody overtakes on an opposite lane, as the network allows (neigh)",
-    b'type="delay_based"': "a saved state does not hold what traffic lights of type delay_based have measured",
-}
-"""What SUMO's states lack, by words of files."""
 
 
 class NoSnapshot(Exception):  # noqa: N818  (an answer, not a failure)
@@ -175,26 +158,12 @@ def snapshot_of(
     before = tuple(piece for time, piece in moving if time < end)
     if not before and until is None:
         raise NoSnapshot(f"nothing departs before t = {end:g} s: there is no traffic to warm up")
-    _check_kept(before)
+    definitions = tuple(piece for piece in constant if not piece.is_traffic)
+    if why := lost_in_traffic(before, definitions, template(files.net)):
+        raise NoSnapshot(why)
     if asked is None and until is None:
         _check_worth(end - begin, before)
-    return Snapshot(
-        begin, end, tuple(piece for piece in constant if not piece.is_traffic), before,
-        tuple(piece for time, piece in moving if time >= end), varying,
-    )  # fmt: skip
-
-
-def _check_kept(before: Sequence[Piece]) -> None:
-    """Refuse traffic of the warm-up of which a state loses what it needs later: over which edges, with what, how fast."""
-    for piece, text in texts_of(before):
-        flow, head = piece.tag.lower().endswith("flow"), text.partition(b">")[0]
-        lost = (
-            "via" if b" via=" in head else
-            "parameters" if flow and b"<param" in text else
-            "speed or duration of walks" if piece.tag == "personFlow" and _HOW_IT_WALKS.search(text) else ""
-        )  # fmt: skip
-        if lost:
-            raise NoSnapshot(f"{piece.place}: a saved state does not hold the {lost} of '{piece.id}', which begins before t0")
+    return Snapshot(begin, end, definitions, before, tuple(piece for time, piece in moving if time >= end), varying)
 
 
 def _end_of_warm_up(varying: tuple[Piece, ...], space: ParameterSpace, begin: float, step: float, asked: WarmUp | None) -> float:
@@ -230,27 +199,15 @@ def _check_options(files: SumoFiles) -> None:
         place = files.places.get(name, "options")
         if placeholders(value, place):
             raise NoSnapshot(f"{place}: the option {name} depends on an input")
-        if name in _FORBIDDEN and value != _FORBIDDEN[name]:
-            raise NoSnapshot(f"{place}: runs with the option {name} {value} load their traffic")
-        if name.startswith("device.toc"):
-            raise NoSnapshot(f"{place}: {_TAKE_OVER}")
-        if name == "lanechange.duration" and seconds_of(value) != 0.0:
-            raise NoSnapshot(f"{place}: a saved state does not hold lane changes that take time (lanechange.duration {value})")
-
-
-@kept
-def _not_saved(file: Template) -> str:
-    """Return what SUMO's states do not hold of what is in a file; "" where nothing of the kind is known."""
-    with file.opened() as opened:
-        text = opened.read()
-    return next((why for word, why in _NOT_SAVED.items() if word in text), "")
+        if why := lost_by_option(name, value):
+            raise NoSnapshot(f"{place}: {why}")
 
 
 def _check_surroundings(files: SumoFiles) -> None:
     """Refuse what a saved state does not hold, and inputs anywhere but in traffic."""
     _check_options(files)
     for one in files.templates:
-        if why := _not_saved(one):
+        if why := lost_in_file(one):
             raise NoSnapshot(f"{one.path}: {why}")
         if one.root[0] == "net":
             if one.placeholders:
