@@ -253,6 +253,21 @@ def test_files_of_a_store_that_was_moved_with_them_are_known(tmp_path: Path):
     assert f"all that is stored of the run is the same, but what is not may differ, as files were changed since: {cars}" in said
 
 
+def test_files_that_a_replay_writes_itself_are_none_of_the_users(tmp_path: Path):
+    """The type of an ego of another model is in a file of its own: it was said to have changed since."""
+    files_of("own_files", tmp_path)
+    ego = "ego: {kind: sumo, model: IDM, tau: 0.8}"
+    text = f"campaign: coverage\nscenario: scenario.yaml\nbudget: 2\n{ego}\nexecutor: {{kind: serial}}\n"
+    (tmp_path / "study.yaml").write_text(text)
+    sbt.run(tmp_path / "study.yaml", store=tmp_path / "store", report=False)
+    again = sbt.open(tmp_path / "store", trust=True).replay(1)
+    assert (again.identical, again.changed) == (True, ())
+    assert "\nidentical to the stored run\n" in replayed(tmp_path / "store", 1)[1]
+    cars = tmp_path / "cars.rou.xml"
+    cars.write_text(cars.read_text().replace("<routes>", "<routes><!-- the same -->"))
+    assert sbt.open(tmp_path / "store", trust=True).replay(1).changed == (cars,)
+
+
 def test_files_of_another_campaign_are_not_those_of_a_replay(tmp_path: Path):
     """In a Python session both were read; a file that runs alone read is one of the store's."""
     for name in ("own", "other"):

@@ -14,6 +14,7 @@ import numpy as np
 from sbt.errors import InputError
 from sbt.plugins import kept, noted
 from sbt.problem.arrays import Points
+from sbt.sumo.places import made_here
 
 __all__ = ["Lane", "Roads", "lanes", "net_file", "nets_folder", "pavements", "roads"]
 
@@ -72,7 +73,7 @@ def net_file(net: str) -> Path:
     if not path.is_file():
         known = ", ".join(sorted(p.name for p in nets_folder().iterdir() if p.is_dir()))
         raise InputError(f"a network must be one of {known}, or an existing .net.xml file, but got '{net}'")
-    _check_well_formed(noted(path))
+    _check_well_formed(path if made_here(path) else noted(path))
     return path.resolve()
 
 

@@ -6,11 +6,13 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
-__all__ = ["inserted_at", "made_here", "place_in", "said_at", "stands_for"]
+__all__ = ["inserted_at", "made_here", "makes_in", "place_in", "said_at", "stands_for"]
 
 _ELSEWHERE: dict[str, Mapping[int, str]] = {}
 """Of files of this process: line to where the user wrote what is there."""
 
+_OWN: set[Path] = set()
+"""Folders of files that this package writes."""
 _KEYS = {"departPos": "position", "departLane": "lane", "departSpeed": "speed", "depart": "at"}
 """Of `insert`, for SUMO's attributes."""
 
@@ -25,9 +27,14 @@ def stands_for(path: Path, places: Mapping[int, str]) -> None:
     _ELSEWHERE[str(path)] = places
 
 
+def makes_in(folder: Path) -> None:
+    """Let all files in a folder be none of the user's."""
+    _OWN.update((folder, folder.resolve()))
+
+
 def made_here(path: Path) -> bool:
-    """Return whether a file is none of the user's: it stands for what the user wrote elsewhere."""
-    return str(path) in _ELSEWHERE
+    """Return whether a file is none of the user's, as this package wrote it: it did not change when it is newer than a store."""
+    return any(path.is_relative_to(folder) for folder in _OWN)
 
 
 def inserted_at(place: str) -> bool:

@@ -34,6 +34,7 @@ from sbt.problem.outcome import Status
 from sbt.processes import scratch
 from sbt.sumo.actors import VehicleType
 from sbt.sumo.formatting import format_number
+from sbt.sumo.places import makes_in
 from sbt.sumo.replicas import replicated_net
 
 __all__ = [
@@ -135,7 +136,9 @@ class Setup:
 
 @cache
 def _scratch() -> tempfile.TemporaryDirectory[str]:
-    return scratch("sumo")
+    folder = scratch("sumo")
+    makes_in(Path(folder.name))
+    return folder
 
 
 def scratch_folder() -> Path:
