@@ -540,6 +540,29 @@ def test_trains_and_level_crossings_are_not_warmed_up_together(tmp_path):
     assert "level crossings" in simulation(path).isolation.why
 
 
+@pytest.mark.sumo
+def test_files_in_the_encoding_that_they_declare_give_the_runs_of_utf8(tmp_path):
+    """Their elements stood as they were in files of UTF-8: SUMO failed in every run with warmed traffic."""
+    traces = []
+    for encoding in ("UTF-8", "ISO-8859-1", "windows-1252"):
+        path = town(tmp_path / encoding, warm_up="warm_up: {seeds: 1}")
+        for name in ("buses.rou.xml", "stops.add.xml"):
+            text = (path.parent / name).read_text().replace('"late"', '"später"').replace('"bs0"', '"ß 0"')
+            head = f'<?xml version="1.0" encoding="{encoding}"?>\n'
+            (path.parent / name).write_bytes((head + text).encode(encoding))
+        traces.append(simulation(path)(CENTRE, 4))
+    assert any(name.startswith("später") for name in traces[0].actors)
+    assert all(trace.identical(traces[0]) for trace in traces)
+
+
+@pytest.mark.parametrize(("encoding", "why"), [("x-none", "unknown encoding"), ("ascii", "ordinal not in range"), ("UTF-16", "")])
+def test_a_file_in_another_encoding_than_it_declares_is_told(tmp_path, encoding, why):
+    path = tmp_path / "a.rou.xml"
+    path.write_text(f'<?xml version="1.0" encoding="{encoding}"?><routes><route id="ü" edges="a"/></routes>', encoding="utf-8")
+    with pytest.raises(InputError, match=rf"a.rou.xml:1:1: .* encoding that it declares, {encoding}, but: .*{why}"):
+        template(path)
+
+
 def test_memories_of_who_departs_later_are_no_obstacle(tmp_path):
     """The ego alone is an ambulance; types that nobody has, and values that mean nothing, are none either."""
     unused = '<vType id="u" startupDelay="1"/><vType id="v" startupDelay="0" jmDriveAfterRedTime="-1"/>'

@@ -40,6 +40,9 @@ _START_TAG = re.compile(rb"<(?:[^>\"']|\"[^\"]*\"|'[^']*')*>")
 _REFERENCE = re.compile(rb"(\s(?:href|file)\s*=\s*)(\"[^\"]*\"|'[^']*')")
 _REFERRING = ("include", "variableSpeedSign", "rerouter")
 """Elements whose `href` or `file` names another file, relative to the file that contains the element."""
+_ENCODING = re.compile(rb"(<\?xml\s[^>]*?\bencoding\s*=\s*[\"'])([A-Za-z][\w.-]*)")
+_HEAD = 64
+"""Bytes in which a file shows that it is not encoded byte by byte."""
 _SMALL, _TIMES_SMALLER = 2**25, 100
 """Bytes to which any packed file may unpack, and how much larger than packed; SUMO's XML is packed to a tenth or thirtieth."""
 _VEHICLES = ("vehicle", "trip", "flow")
@@ -102,7 +105,7 @@ class Template:
         parts: what is replaced in a copy, in order.
         vehicles: vehicles, trips and flows by id.
         persons: line and column of persons and flows of them, by id.
-        data: the bytes of the file; empty if there is nothing to replace.
+        data: the bytes of the file in UTF-8; empty if there is nothing to replace.
     """
 
     path: Path
@@ -118,7 +121,7 @@ class Template:
         return tuple(name for name, vehicle in self.vehicles.items() if vehicle.varies)
 
     def opened(self) -> BinaryIO:
-        """Open the file for reading, unpacked."""
+        """Open the file for reading, unpacked and in UTF-8."""
         return io.BytesIO(_read(self.path))
 
     @cached_property
@@ -229,11 +232,11 @@ def _placeholder(text: str, place: str, attribute: str = "") -> Placeholder:
 
 
 def _read(path: Path) -> bytes:
-    """Return the bytes of a file, decompressed if it is gzipped."""
+    """Return the bytes of a file in UTF-8, decompressed if it is gzipped."""
     try:
         data = path.read_bytes()
         if data[:2] != b"\x1f\x8b":
-            return data
+            return _in_utf8(data, path)
         most = max(_SMALL, _TIMES_SMALLER * len(data))
         with gzip.open(io.BytesIO(data)) as file:
             text = file.read(most + 1)
@@ -241,7 +244,22 @@ def _read(path: Path) -> bytes:
         raise InputError(f"a SUMO file must be readable, but {path} is not: {error}") from None
     if len(text) > most:
         raise InputError(f"a packed SUMO file may unpack to {_TIMES_SMALLER} times its size, but {path} unpacks to more")
-    return text
+    return _in_utf8(text, path)
+
+
+def _in_utf8(data: bytes, path: Path) -> bytes:
+    """Return the bytes of a file in UTF-8, and its declaration with them: parts of it are put into other files."""
+    declared = _ENCODING.match(data)
+    if declared is None or b"\0" in data[:_HEAD] or declared[2].lower() in (b"utf-8", b"utf8", b"us-ascii"):
+        return data
+    encoding = declared[2].decode()
+    try:
+        text = data.decode(encoding)
+        if not text.startswith("<?xml"):
+            raise ValueError("its declaration is in another one")
+    except (LookupError, ValueError) as error:
+        raise InputError(f"{path}:1:1: a SUMO file must be in the encoding that it declares, {encoding}, but: {error}") from None
+    return declared[1] + b"UTF-8" + text.encode()[declared.end(2) :]
 
 
 @kept
@@ -253,7 +271,7 @@ def template(path: Path) -> Template:
             placeholder that is not a formula; the message begins with file, line and column.
     """
     data = _read(path if made_here(path) else noted(path))
-    if b"\0" in data[:64]:
+    if b"\0" in data[:_HEAD]:
         raise InputError(f"{path}: a SUMO file must be encoded byte by byte (UTF-8), but it has zero bytes")
     parser = xml.parsers.expat.ParserCreate()
     roots: list[tuple[str, Mapping[str, str]]] = []
