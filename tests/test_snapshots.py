@@ -294,6 +294,7 @@ WRONG_NAMES = {  # what is written, what is written instead, where and what is s
     "id": ("  other:", "  t56:", r"6:3: insert.t56: an inserted vehicle must have an id of its own, but 't56' is in cars.rou"),
     "time": ("until: 42", "until: auto", r"5:8: insert.ego: a vehicle must have a time"),  # and the ego is there all the same
     "until": ("until: 42", "until: soon", r"3:18: warm_up.until: must be a number or 'auto', but got 'soon'"),
+    "at": ("to: C3D3", "to: C3D3, at: 44.05", r"5:\d+: insert.ego.at: a start must be whole steps of 0.1 s after 0 s, .* 44.05"),
     "input": ("gap: {min", "gab: {min", r"insert.ego: \${gap}: a placeholder must be one of v, gab, but got 'gap'"),
 }
 
@@ -305,6 +306,20 @@ def test_a_wrong_name_of_an_insertion_is_told_at_its_key_and_alone(tmp_path, wro
     with pytest.raises(InputError, match=said) as caught:
         from_file(str(path), tmp_path)
     assert len(str(caught.value).splitlines()) == (2 if wrong == "time" else 1)  # both vehicles lack the time
+
+
+@pytest.mark.parametrize(("step", "begin", "at"), [(0.2, 0, 43.5), (0.2, 0.2, 43.5), (0.05, 0, 43.51), (1.0, 0, 43.5)])
+def test_an_insertion_starts_at_a_step(tmp_path, step, begin, at):
+    """SUMO inserted it in the next step, at the place that was meant for half a step earlier."""
+    path = inserting(tmp_path, warm="{until: auto}", more=f", at: {at}")
+    options = f"options: {{step-length: {step}, begin: {begin}}}"
+    text = path.read_text().replace("[stops.add.xml]}", f"[stops.add.xml], {options}}}")
+    path.write_text(text.replace("to: C3D3", f"at: {44 - begin}, to: C3D3"))
+    with pytest.raises(InputError, match=rf"6:\d+: insert.other.at: a start must be whole steps of {step:g} s after") as caught:
+        from_file(str(path), tmp_path)
+    assert len(str(caught.value).splitlines()) == 1
+    path.write_text(path.read_text().replace(f"at: {at}", f"at: {begin + round((at - begin) / step) * step:.10g}"))
+    assert from_file(str(path), tmp_path).simulate is not None
 
 
 LOOP = """

@@ -8,6 +8,7 @@ from pathlib import Path
 from sbt.config.scenario_model import InsertEntry, ScenarioModel
 from sbt.config.source import Key, Problems
 from sbt.errors import did_you_mean
+from sbt.sumo.demand import seconds_of
 from sbt.sumo.elements import elements
 from sbt.sumo.files import SumoFiles
 from sbt.sumo.inserting import InsertedVehicle, inserted_file
@@ -18,6 +19,8 @@ __all__ = ["insertion_file"]
 _TYPES = ("DEFAULT_VEHTYPE", "DEFAULT_BIKETYPE", "DEFAULT_TAXITYPE", "DEFAULT_RAILTYPE")
 """Vehicle types that SUMO knows by itself."""
 _SHOWN = 8
+_STEP, _TOLERANCE = 0.1, 1e-6
+"""Step where neither the scenario nor its files have one, and how near a time must be to a step (s)."""
 
 
 def insertion_file(model: ScenarioModel, files: SumoFiles, problems: Problems) -> Path | None:
@@ -39,6 +42,7 @@ def insertion_file(model: ScenarioModel, files: SumoFiles, problems: Problems) -
             place = f"{found[1].path.name}:{found[0].place[0]}:{found[0].place[1]}"
             problems.add(path, f"an inserted vehicle must have an id of its own, but '{name}' is in {place} already", at_key=True)
         _check_names(entry, net, types, path, problems)
+        _check_time(entry.at, files, model.step_length, (*path, "at"), problems)
     vehicles = {name: _vehicle(name, entry, model, problems) for name, entry in model.insert.items()}
     places = {name: problems.source.located(("insert", name), "").rstrip(": ") for name in vehicles}
     return inserted_file(vehicles, places)
@@ -59,6 +63,17 @@ def _vehicle(name: str, entry: InsertEntry, model: ScenarioModel, problems: Prob
         str(at), entry.edge, str(entry.lane), str(entry.position), str(entry.speed), entry.type or "",
         (entry.to,) if entry.to is not None else entry.route, known_route=entry.to is None,
     )  # fmt: skip
+
+
+def _check_time(at: float | str | None, files: SumoFiles, step: float | None, path: Key, problems: Problems) -> None:
+    """Refuse a time within a step: SUMO would insert the vehicle in a later one, at the place that is meant for this time."""
+    begin = seconds_of(files.options.get("begin", "0"))
+    time = seconds_of(str(at))
+    step = step or files.step_length() or _STEP
+    if time is None or begin is None:  # an input, or none
+        return
+    if abs(round((time - begin) / step) * step - (time - begin)) > _TOLERANCE:
+        problems.add(path, f"a start must be whole steps of {step:g} s after {begin:g} s, but is {time:.10g} s")
 
 
 def _check_names(entry: InsertEntry, net: Roads, types: Collection[str], path: Key, problems: Problems) -> None:
