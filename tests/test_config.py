@@ -17,6 +17,7 @@ from sbt.config.assemble import acquisition_of, assemble, metamodel_of, scenario
 from sbt.config.executor_model import EXECUTORS
 from sbt.config.kinds import kinds
 from sbt.config.load import ConfigError, dump, fingerprint, load, parse, resolve, resumed, schema
+from sbt.config.source import read_value
 from sbt.metamodels.extra_trees import ExtraTrees
 
 BASE = "campaign: boundary\nscenario: plugin.py:SCENARIO\n"
@@ -240,12 +241,23 @@ def test_set_replaces_and_adds_values(tmp_path: Path):
         ("a..b=3", "--set a..b=3: must be key.path=value"),
         ("scenario.b=2", "--set scenario.b: --set reaches into mappings only, but 'b' would be inside 'plugin.py:SCENARIO'"),
         ("budget=[1", "--set budget: the value must be YAML, but got '[1'"),
+        (
+            "inputs={d_t: {min: 1}, d_v: {min: 1}, d_t: {max: 2}}",
+            "--set inputs:1:32: d_t: a key must stand once in its mapping, but 'd_t' stands already in line 1",
+        ),
+        ("ego={kind: acc_aeb, settings: {a: 1, a: 2}}", "--set ego:1:34: settings.a: a key must stand once in its mapping"),
     ],
 )
 def test_a_wrong_set_is_refused(override: str, expected: str):
     found = errors(BASE, override)
     assert len(found) == 1
     assert found[0].startswith(expected)
+
+
+def test_a_key_stands_once_in_a_value_of_the_command_line():
+    assert read_value("{a: 1, b: {a: 2}}", "--ego params") == {"a": 1, "b": {"a": 2}}
+    with pytest.raises(ConfigError, match=r"^--ego params:1:8: a: a key must stand once in its mapping"):
+        read_value("{a: 1, a: 1}", "--ego params")
 
 
 def test_yaml_traps_of_the_domain():

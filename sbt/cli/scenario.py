@@ -139,9 +139,9 @@ def check(
 
 def _pairs(what: str, texts: list[str]) -> dict[str, Any]:
     """Return name=value texts by name, values read as YAML."""
-    from sbt.config.source import read_yaml
+    from sbt.config.source import read_value
 
-    return {name: read_yaml(value, f"{what} {name}")[0] for name, value in _texts(what, texts).items()}
+    return {name: read_value(value, f"{what} {name}") for name, value in _texts(what, texts).items()}
 
 
 def _texts(what: str, texts: list[str]) -> dict[str, str]:

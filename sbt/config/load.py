@@ -285,11 +285,12 @@ def _overridden(data: Json, source: SourceMap, overrides: Sequence[str]) -> tupl
             wrong.append(f"--set {text}: must be key.path=value, but got '{text}'")
             continue
         try:
-            value, _, _ = read_yaml(written, f"--set {dotted}")
+            value, _, doubled = read_yaml(written, f"--set {dotted}")
         except ConfigError as error:
             reason = error.errors[0].partition(", but ")[2]
             wrong.append(f"--set {dotted}: the value must be YAML, but got '{written}' ({reason})")
             continue
+        wrong += doubled
         try:
             data = _with(data, path, value)
         except TypeError as error:

@@ -27,6 +27,7 @@ __all__ = [
     "SourceMap",
     "must_be_measured",
     "must_be_one_of",
+    "read_value",
     "read_yaml",
     "yaml_reader",
 ]
@@ -208,6 +209,18 @@ def read_yaml(text: str, name: str) -> tuple[Any, SourceMap, list[str]]:
             texts[path] = value_node.value
     source = SourceMap(name, places, texts=texts)
     return value, source, source.sorted(doubled)
+
+
+def read_value(text: str, name: str) -> Any:
+    """Return the value of a YAML text.
+
+    Raises:
+        ConfigError: as `read_yaml`, or a key stands twice in its mapping.
+    """
+    value, _, doubled = read_yaml(text, name)
+    if doubled:
+        raise ConfigError(doubled)
+    return value
 
 
 def _half_character(value: Any) -> str:

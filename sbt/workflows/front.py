@@ -15,7 +15,7 @@ import numpy as np
 from sbt import plugins
 from sbt.config.load import load
 from sbt.config.scenario_file import is_scenario
-from sbt.config.source import read_yaml
+from sbt.config.source import read_value
 from sbt.errors import InputError, PluginError, SbtError, did_you_mean, must_be
 from sbt.execution.carrying import carry
 from sbt.execution.spec import ScenarioSpec
@@ -195,7 +195,7 @@ def simulate_scenario(
         found = replace(found, metrics=(*found.metrics, *own))
     given = dict(inputs or {})
     if as_text:
-        given = {k: v if k in found.space.choices else read_yaml(str(v), f"input {k}")[0] for k, v in given.items()}
+        given = {k: v if k in found.space.choices else read_value(str(v), f"input {k}") for k, v in given.items()}
     values = found.space.values(given)
     outcome, states = run_traced(found, Job(0, values, int(seed)))
     return Run(found, values, int(seed), outcome, states, "" if isinstance(scenario, LogicalScenario) else str(scenario))

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from sbt.config.load import parse
-from sbt.config.source import read_yaml, yaml_reader
+from sbt.config.source import read_value, read_yaml, yaml_reader
 from sbt.errors import InputError, RunError
 from sbt.execution.worker import run_traced
 from sbt.files import write_atomically
@@ -89,7 +89,7 @@ class Pinned:
 
     @cached_property
     def _study(self) -> Study:
-        given = read_yaml(self.ego, "ego")[0] if isinstance(self.ego, str) and self.ego else self.ego
+        given = read_value(self.ego, "ego") if isinstance(self.ego, str) and self.ego else self.ego
         changes: Json = {"ego": dict(given)} if given else {}
         folder = Path(self.folder).resolve()
         return Study(parse(self.configuration, name="the pinned configuration", folder=folder, changes=changes))
