@@ -42,6 +42,7 @@ T = TypeVar("T")
 Key = tuple[str | int, ...]
 """Path of keys and list positions."""
 _SURROGATE = re.compile("[\ud800-\udfff]")
+_TEXT = ("tag:yaml.org,2002:str", "tag:yaml.org,2002:merge")
 _DEPTH = 30
 """Deeper nesting is an alias that contains itself."""
 
@@ -110,6 +111,9 @@ class SourceMap:
                 line, column = place.key if at_key and prefix == path else place.value
                 subject = f" {dotted}:" if dotted else ""
                 return (0, line, column), f"{self.name}:{line}:{column}:{subject} {message}"
+            below = min((given for given in self.overrides if given[: len(prefix)] == prefix), default=None)
+            if below is not None:  # what is written nowhere else came with it
+                return (1, 0, 0), f"--set {'.'.join(map(str, below))}: {dotted}: {message}"
         return (0, 0, 0), f"{self.name}: {dotted}: {message}"
 
 
@@ -257,12 +261,21 @@ def _walk(node: Node | None, path: Key) -> Iterator[tuple[Key, Place, Node]]:
         yield (), Place(_mark(node), _mark(node)), node
     entries: list[tuple[str | int, Node, Node]] = []
     if isinstance(node, MappingNode):
-        entries = [(key.value, key, value) for key, value in node.value if isinstance(key.value, str)]
+        entries = [(_key(key), key, value) for key, value in node.value]
     elif isinstance(node, SequenceNode):
         entries = [(k, item, item) for k, item in enumerate(node.value)]
     for name, key, value in entries:
         yield (*path, name), Place(_mark(key), _mark(value)), value
         yield from _walk(value, (*path, name))
+
+
+def _key(node: Node) -> str | int:
+    """Return a key as paths have it, and pydantic: the text of what is neither text nor a whole number."""
+    if node.tag in _TEXT:
+        return str(node.value)
+    value = yaml_reader().constructor.construct_object(node, deep=True)
+    value = tuple(value) if isinstance(value, list) else value
+    return value if isinstance(value, str | int) else repr(value)
 
 
 def _mark(node: Node) -> tuple[int, int]:
