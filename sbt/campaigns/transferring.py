@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
 from sbt.errors import InputError, did_you_mean
 from sbt.estimators.transfer import Transfer, Trend
 from sbt.loop.earlier import EarlierRuns
-from sbt.metamodels.base import Metamodel, Predictor
+from sbt.metamodels.base import Metamodel, fitted, named_errors, predicted
 from sbt.metamodels.warp import Warp
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.parameter import Parameter
@@ -97,8 +97,8 @@ def earlier_runs(
         for column in np.atleast_2d(y.T):
             known = np.isfinite(column)
             if known.sum() >= 2:
-                predict = metamodel.fit(_inputs(old.space, kept.x[known]), column[known], rng)
-                column = _integrated(predict, old.space, kept.x, gone, dict(fixed or {}))
+                mean = _mean(metamodel, _inputs(old.space, kept.x[known]), column[known], rng)
+                column = _integrated(mean, old.space, kept.x, gone, dict(fixed or {}))
             columns.append(column)
         y = np.squeeze(np.array(columns).T, axis=-1) if y.ndim == 1 else np.array(columns).T
     return EarlierRuns(_inputs(new.space, x[rows]), y, other)
@@ -166,18 +166,31 @@ def _trend(
         runs, t = runs.where(np.isin(np.arange(len(t)), rows)), t[rows]
     gone = [k for k, name in enumerate(old.names) if name not in new.names]
     if gone:
-        t = _integrated(metamodel.fit(_inputs(old, runs.x), t, rng), old, runs.x, gone, fixed)
+        t = _integrated(_mean(metamodel, _inputs(old, runs.x), t, rng), old, runs.x, gone, fixed)
     columns = [k for k, name in enumerate(new.names) if name in old.names]
     mine = ParameterSpace(tuple(new.parameters[k] for k in columns))
-    predict = metamodel.fit(_inputs(mine, _taken(old, new, runs)[0][:, columns]), t, rng)
-    return Trend(warp, lambda z: predict(_inputs(mine, new.from_normal(z)[:, columns])).mu)
+    mean = _mean(metamodel, _inputs(mine, _taken(old, new, runs)[0][:, columns]), t, rng)
+    return Trend(warp, lambda z: mean(_inputs(mine, new.from_normal(z)[:, columns])))
+
+
+def _mean(metamodel: Metamodel, u: Points, t: Vector, rng: np.random.Generator) -> Callable[[Points], Vector]:
+    """Return the mean that a metamodel predicts, fitted to u (n, d), t (n,), as a function of points."""
+    predictor = fitted(metamodel, u, t, rng)
+
+    def mean(points: Points) -> Vector:
+        with named_errors(metamodel, len(t)):
+            return predicted(predictor, points).mu
+
+    return mean
 
 
 def _inputs(space: ParameterSpace, x: Points) -> Points:
     return space.metamodel_inputs(space.to_unit(x))
 
 
-def _integrated(predict: Predictor, old: ParameterSpace, x: Points, gone: list[int], fixed: dict[str, Value]) -> Vector:
+def _integrated(
+    mean: Callable[[Points], Vector], old: ParameterSpace, x: Points, gone: list[int], fixed: dict[str, Value]
+) -> Vector:
     """Return the prediction at old runs, with inputs that are gone fixed or integrated over their distribution."""
     from scipy.special import ndtri
     from scipy.stats import qmc
@@ -189,5 +202,5 @@ def _integrated(predict: Predictor, old: ParameterSpace, x: Points, gone: list[i
         for k in gone:
             p = old.parameters[k]
             at[:, k] = p.number(fixed[p.name]) if p.name in fixed else point[k]
-        total += predict(_inputs(old, at)).mu
+        total += mean(_inputs(old, at))
     return total / len(even)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sbt.metamodels.base import Metamodel
+from sbt.metamodels.base import Metamodel, fitted
 from sbt.problem.arrays import Points, Vector
 
 __all__ = ["Subspace", "find_subspace", "inputs_that_matter", "unit"]
@@ -82,7 +82,7 @@ def inputs_that_matter(metamodel: Metamodel, z: Points, t: Vector, rng: np.rando
         for k in range(_FOLDS):
             rest = fold != k
             space = find_subspace(z[rest], t[rest], choose(z[rest], t[rest]))
-            predictor = metamodel.fit(unit(space.reduce(z[rest])), t[rest], rng)
+            predictor = fitted(metamodel, unit(space.reduce(z[rest])), t[rest], rng)
             error[~rest] = t[~rest] - predictor(unit(space.reduce(z[~rest]))).mu
         return 1.0 - float((error**2).mean() / max(float(t.var()), 1e-300))
 

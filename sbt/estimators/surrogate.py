@@ -20,7 +20,7 @@ from scipy.special import ndtr
 from sbt.estimators.leaps import leaping
 from sbt.estimators.ridge import ridge_trend
 from sbt.estimators.transfer import Trend, trended
-from sbt.metamodels.base import Metamodel, Predictor, named_errors, predicted, sketched, with_target, without_repetitions
+from sbt.metamodels.base import Metamodel, Predictor, fitted, named_errors, predicted, sketched, with_target, without_repetitions
 from sbt.metamodels.censored import Limit, beyond
 from sbt.metamodels.gaps import better_without_gap
 from sbt.metamodels.joint import joined_log_probability
@@ -157,8 +157,7 @@ class _Form:
         """Return the predictor of the values, learned from some rows of u (n, d)."""
         values = self.values if self.trend is None else self.values - self.trend(u)
         target = with_target(metamodel, self.interval) if self.trend is None else metamodel
-        with named_errors(metamodel, len(u)):
-            predictor = target.fit(u[rows], values[rows], rng)
+        predictor = fitted(target, u[rows], values[rows], rng)
         less = self.trend(self.limit.u) if self.limit is not None and self.trend is not None else 0.0
         limit = None if self.limit is None else self.limit.moved(lambda value: value - less)
         return _Learned(self, beyond(predictor, limit), metamodel, len(u))

@@ -16,7 +16,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from sbt.metamodels.base import Metamodel, Predictor, named_errors, predicted, without_repetitions
+from sbt.metamodels.base import Metamodel, Predictor, fitted, named_errors, predicted, without_repetitions
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.warp import Warp
 from sbt.problem.arrays import Points, Vector
@@ -112,17 +112,17 @@ def _slope(old: Vector, t: Vector) -> float:
 def _score(metamodel: Metamodel, u: Points, rest: Vector, rng: np.random.Generator) -> tuple[float, Predictor]:
     """Return the mean log density of each row as predicted from the others, and the metamodel of all."""
     u, rest = without_repetitions(u, rest)  # each input counts once
-    with named_errors(metamodel, len(rest)):
-        predict = metamodel.fit(u, rest, rng)
+    predict = fitted(metamodel, u, rest, rng)
     if isinstance(predict, _LeavesOut):
         left = predict.leave_one_out(u, rest)
         return _log_density(left, rest), predict
     fold = rng.permutation(len(rest)) % _FOLDS
     found = np.empty(len(rest))
     for k in range(_FOLDS):
+        other = fitted(metamodel, u[fold != k], rest[fold != k], rng)
         with named_errors(metamodel, len(rest)):
-            other = metamodel.fit(u[fold != k], rest[fold != k], rng)
-        found[fold == k] = _log_densities(other(u[fold == k]), rest[fold == k])
+            left = predicted(other, u[fold == k])
+        found[fold == k] = _log_densities(left, rest[fold == k])
     return float(found.mean()), predict
 
 

@@ -38,7 +38,7 @@ from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
 __all__ = [
-    "Metamodel", "Predictor", "Screened", "TargetAware", "build", "check_rows", "gives_different", "is_rate",
+    "Metamodel", "Predictor", "Screened", "TargetAware", "build", "check_rows", "fitted", "gives_different", "is_rate",
     "log_ambiguity_bound", "named_errors", "once", "predicted", "sample_paths", "simplest", "sketched", "split_validation",
     "standardise", "with_target", "without_repetitions",
 ]  # fmt: skip
@@ -123,7 +123,7 @@ def sample_paths(predictor: Predictor, u: Points, n: int, rng: np.random.Generat
     """
     own: Any = getattr(predictor, "sample_paths", None)
     if own is not None:
-        return own(u, n, rng)
+        return own(np.array(u), n, rng)
     p = predicted(predictor, u)
     component = rng.choice(len(p.weight), n, p=p.weight)
     if len(p.weight) >= _MIXED:
@@ -240,6 +240,12 @@ def named_errors(metamodel: Metamodel, n: int) -> Iterator[None]:
             yield
         except PredictionError as error:
             raise InputError(f"metamodel {name}, fitted to {n} rows: {error}") from error
+
+
+def fitted(metamodel: Metamodel, u: Points, y: Vector, rng: np.random.Generator) -> Predictor:
+    """Return what a metamodel learns from rows u (n, d), y (n,), in `named_errors`; it may change the copies that it gets."""
+    with named_errors(metamodel, len(y)):
+        return metamodel.fit(np.array(u), np.array(y), rng)
 
 
 def predicted(predict: Predictor, u: Points) -> Prediction:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sbt.metamodels.base import Metamodel, Predictor, check_rows, predicted, split_validation, with_target
+from sbt.metamodels.base import Metamodel, Predictor, check_rows, fitted, predicted, split_validation, with_target
 from sbt.metamodels.prediction import Prediction
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
@@ -48,11 +48,11 @@ class Recalibrated:
         factor = 1.0
         if len(y) >= _FEWEST:
             held_out, training = split_validation(len(y))
-            prediction = predicted(self.metamodel.fit(u[training], y[training], rng), u[held_out])
+            prediction = predicted(fitted(self.metamodel, u[training], y[training], rng), u[held_out])
             z = (y[held_out] - prediction.mu) / prediction.sigma
             size = max(float(np.sqrt(np.mean(z**2))), _LEAST)
             factor = size ** (len(z) / (len(z) + _PRIOR))
-        return RecalibratedPredictor(self.metamodel.fit(u, y, rng), factor)
+        return RecalibratedPredictor(fitted(self.metamodel, u, y, rng), factor)
 
 
 @dataclass(frozen=True, eq=False)

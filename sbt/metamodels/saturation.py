@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.distance import cdist
 from scipy.special import log_ndtr
 
-from sbt.metamodels.base import Metamodel, Predictor, Screened, is_rate, sample_paths, sketched, with_target
+from sbt.metamodels.base import Metamodel, Predictor, Screened, fitted, is_rate, sample_paths, sketched, with_target
 from sbt.metamodels.censored import Limit, beyond
 from sbt.metamodels.prediction import Prediction, Scale, reached_beyond
 from sbt.metamodels.rounded import StepAware, rounding
@@ -310,7 +310,7 @@ class Opened:
         else:
             metamodel, learned, limit = self.metamodel, centred(u, y, critical), None
         steps = _steps(y, learned) if limit is None else ()
-        predictor = beyond(metamodel.fit(u, learned, rng), limit)
+        predictor = beyond(fitted(metamodel, u, learned, rng), limit)
         lowest, highest = _ends(self.critical, y)
         if critical != self.critical:  # what goes on beyond the last value is not beyond an end of M_c that no run lies beyond
             lowest = y.min() if critical.low < self.critical.low and learned.min() < y.min() else lowest

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from sbt.metamodels.base import named_errors, predicted, sample_paths
+from sbt.metamodels.base import fitted, predicted, sample_paths
 from sbt.metamodels.bootstrap import drawn_regression
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.samplers.noise import by_chance, scores
@@ -72,8 +72,7 @@ def propose_in_noise(
     candidates = _candidates(search, seen, best, rng)
     inputs, at = search.columns(u), search.columns(candidates)
     noisy = search.for_noise(seen.u, seen.y)
-    with named_errors(noisy.metamodel, len(u)):
-        process = noisy.metamodel.fit(inputs, score, rng)
+    process = fitted(noisy.metamodel, inputs, score, rng)
     model = fit_warped(noisy, seen.u, seen.y, rng, seen.success)
     nowhere = bool(model.log_probability(candidates, _INFLATION).max() < math.log(_HOPELESS))
     filled = round(_FILLING * n) if nowhere else 0

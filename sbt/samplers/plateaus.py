@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.distance import cdist
 from scipy.special import log_ndtr
 
-from sbt.metamodels.base import Predictor, named_errors, predicted
+from sbt.metamodels.base import fitted, named_errors, predicted
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.samplers.search import Search, SearchData, fill_uniformly
 
@@ -134,17 +134,18 @@ def _latent(
     value = np.arcsinh(margin / max(scale, 1e-300))
     floor = float(value[flat].max())
     with named_errors(search.metamodel, int(ok.sum())):
-        around = search.metamodel.fit(inputs[ok & ~flat], value[ok & ~flat], rng)
+        around = fitted(search.metamodel, inputs[ok & ~flat], value[ok & ~flat], rng)
         guess = predicted(around, inputs[flat])
         mean, std = guess.mu, guess.sigma
         beneath = value.copy()
         beneath[flat] = _truncated(mean, std, floor)
-        fitted: Predictor = search.metamodel.fit(inputs[ok], beneath[ok], rng)
-    quick: Callable[[Points], Vector] | None = getattr(fitted, "mu", None)
+        predictor = fitted(search.metamodel, inputs[ok], beneath[ok], rng)
+    quick: Callable[[Points], Vector] | None = getattr(predictor, "mu", None)
 
     def latent(points: Points) -> Vector:
         inputs = search.columns(points)
-        return fitted(inputs).mu if quick is None else quick(inputs)
+        with named_errors(search.metamodel, int(ok.sum())):
+            return quick(inputs) if callable(quick) else predicted(predictor, inputs).mu
 
     return latent, floor
 

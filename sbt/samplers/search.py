@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-from sbt.metamodels.base import Metamodel, Predictor, gives_different, named_errors, predicted, sample_paths
+from sbt.metamodels.base import Metamodel, Predictor, fitted, gives_different, named_errors, predicted, sample_paths
 from sbt.metamodels.joint import metamodel_for
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.saturation import on_side
@@ -171,8 +171,7 @@ def fit_warped(search: Search, u: Points, y: Vector, rng: np.random.Generator, s
     """Return the metamodel fitted to u (n, d) and the warped y (n,), finite, n >= 2; `success` is passed on."""
     warp = warp_around(y, search.critical)
     inputs, target = search.columns(u), warp.interval(search.critical)
-    with named_errors(search.metamodel, len(y)):
-        predictor = metamodel_for(search.metamodel, target).fit(inputs, warp.learned(y), rng)
+    predictor = fitted(metamodel_for(search.metamodel, target), inputs, warp.learned(y), rng)
     critical = MARGIN if isinstance(target, CombinedInterval) else target
     return WarpedModel(predictor, search.columns, warp, critical, search.metamodel, len(y), success)
 
