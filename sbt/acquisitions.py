@@ -16,7 +16,7 @@ from typing import TypeVar
 import numpy as np
 from scipy.special import ndtr
 
-from sbt.errors import InputError, described
+from sbt.errors import RAISED, InputError, described
 from sbt.metamodels.prediction import Prediction
 from sbt.problem.arrays import Vector
 from sbt.problem.requirement import CriticalInterval
@@ -69,7 +69,7 @@ def log_scores(acquisition: Acquisition, prediction: Prediction, critical: Criti
     n, name = len(prediction), _name(acquisition)
     try:
         found = np.asarray(acquisition(prediction, critical, log_density.copy()), dtype=np.float64)
-    except Exception as error:
+    except RAISED as error:
         raise InputError(f"acquisition {name} must score {n} points, but raised {described(error)}") from error
     if found.shape != (n,):
         raise InputError(f"acquisition {name} must return shape ({n},), but returned {found.shape}")

@@ -12,9 +12,13 @@ from contextlib import contextmanager
 from difflib import get_close_matches
 
 __all__ = [
-    "InputError", "PluginError", "RunError", "SbtError", "StoreError", "UnwritableError", "described", "did_you_mean", "must_be",
-    "must_take", "naming", "place_of",
+    "RAISED", "InputError", "PluginError", "RunError", "SbtError", "StoreError", "UnwritableError", "described", "did_you_mean",
+    "must_be", "must_take", "naming", "place_of",
 ]  # fmt: skip
+
+
+RAISED = (Exception, SystemExit)
+"""What somebody's own code may raise and is told of: a `sys.exit()` in it would end the program, maybe with exit code 0."""
 
 
 class SbtError(Exception):
@@ -117,7 +121,7 @@ def naming(rule: str) -> Iterator[None]:
         yield
     except SbtError:
         raise
-    except Exception as error:
+    except RAISED as error:
         raise SbtError(f"{rule}, but raised {described(error)}") from error
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable
 from importlib.metadata import EntryPoint
 from pathlib import Path
@@ -261,6 +262,44 @@ class Columns:
 class Raises:
     def fit(self, u, y, rng):
         raise ArithmeticError("no")
+
+
+class Leaves:
+    """Ends the program well, where a script would have to say that nothing was found."""
+
+    def __init__(self, where="fit"):
+        self.where = self.at("__init__", where)
+
+    def at(self, place, where):
+        return sys.exit(0) if place == where else where
+
+    def fit(self, u, y, rng):
+        self.at("fit", self.where)
+        return lambda v: self.at("predict", self.where) and Prediction.gaussian(v[:, 0], np.ones(len(v)))
+
+
+def leaving(prediction, critical, log_density):
+    sys.exit(0)
+
+
+@pytest.mark.parametrize("campaign", ["boundary", "falsification", "estimation"])
+@pytest.mark.parametrize("where", ["__init__", "fit", "predict"])
+def test_code_that_ends_the_program_is_an_error_that_names_it(tmp_path, campaign, where):
+    line = sbt.Scenario("line", [sbt.Parameter("a", 0, 1)], sbt.Requirement("y", high=0.2), evaluate=lambda v, s: {"y": v["a"]})
+    said = "Leaves does not take the settings" if where == "__init__" else "metamodel Leaves must learn from .* rows and predict"
+    with pytest.raises(sbt.SbtError, match=rf"{said}.* SystemExit: 0"):
+        sbt.run(campaign=campaign, scenario=line, metamodel={"kind": Leaves, "where": where}, budget=20, initial=10, batch=10,
+                executor="serial", store=tmp_path / "s", report=False)  # fmt: skip
+
+
+def test_an_acquisition_and_a_check_that_end_the_program_do_not():
+    prediction = Prediction.gaussian(np.zeros(3), np.ones(3))
+    with pytest.raises(InputError, match="acquisition leaving must score 3 points, but raised SystemExit: 0"):
+        log_scores(leaving, prediction, CriticalInterval(high=0.0), np.zeros(3))
+    with pytest.raises(ContractError, match=r"a metamodel must learn from .* but raised SystemExit"):
+        check_metamodel(Leaves(), dimensions=(2,))
+    with pytest.raises(ContractError, match=r"an acquisition must score .* but raised SystemExit"):
+        check_acquisition(leaving)
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,7 @@ from typing import Any, Protocol, TypeVar, overload, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from sbt.errors import InputError, SbtError, did_you_mean, naming
+from sbt.errors import RAISED, InputError, SbtError, did_you_mean, naming
 from sbt.metamodels.prediction import Prediction, PredictionError
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
@@ -164,7 +164,7 @@ def build(kind: Any, preset: str | None = None, settings: Mapping[str, Any] | No
             made = kind(**values)
         except SbtError:
             raise
-        except Exception as error:  # e.g. a comparison of text with a number
+        except RAISED as error:  # e.g. a comparison of text with a number
             raise InputError(f"{name} does not take the settings {values}: {type(error).__name__}: {error}") from error
     elif values:
         raise InputError(f"{name} is an object, which takes no settings, but got {', '.join(values)}; name its class instead")

@@ -10,7 +10,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from sbt.errors import InputError, SbtError, described
+from sbt.errors import RAISED, InputError, SbtError, described
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.plain import Values, written
 from sbt.problem.scenario import LogicalScenario, Simulate
@@ -124,7 +124,7 @@ def _told(source: DrawsAhead, values: Values, seed: int) -> Mapping[str, float] 
         found = source.known_before(values, seed)
     except SbtError:
         raise
-    except Exception as error:
+    except RAISED as error:
         raise InputError(
             f"covariates must be known before the run, but at {written(values)}, seed {seed} computing them raised"
             f" {described(error)}"

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from sbt.acquisitions import Acquisition
 from sbt.campaigns.settings import CampaignKind, Settings
-from sbt.errors import RunError, SbtError, described
+from sbt.errors import RAISED, RunError, SbtError, described
 from sbt.loop.stages import Campaign, Progress
 from sbt.metamodels.base import Metamodel, Predictor
 from sbt.metamodels.prediction import Prediction
@@ -77,7 +77,7 @@ def check_metamodel(metamodel: Metamodel, *, dimensions: tuple[int, ...] = (1, 2
         try:
             predictor, same = fit(u, y), fit(u, y)
             prediction = predictor(at.copy())
-        except Exception as error:
+        except RAISED as error:
             raise ContractError(f"a metamodel must learn from {len(y)} rows and predict, but raised {error!r}") from error
         _check_prediction(prediction, len(at), f"d = {d}")
         _check_predictor(predictor, same, at, prediction)
@@ -126,7 +126,7 @@ def check_acquisition(acquisition: Acquisition, *, seed: int = 0) -> None:
 def _scored(acquisition: Acquisition, prediction: Prediction, critical: CriticalInterval, log_density: Vector) -> Vector:
     try:
         return np.asarray(acquisition(prediction, critical, log_density), dtype=np.float64)
-    except Exception as error:
+    except RAISED as error:
         raise ContractError(f"an acquisition must score {len(prediction)} points, but raised {error!r}") from error
 
 
@@ -248,7 +248,7 @@ def _ran(
         )
     except (_StoppedError, ContractError):
         raise
-    except Exception as error:
+    except RAISED as error:
         raise ContractError(f"a campaign must run to its end, but raised {described(error)} ({case})") from error
     return found, [dataclasses.replace(record, seconds=0.0, versions="") for record in found.history.records]
 
@@ -258,7 +258,7 @@ def _check_conclusion(result: Result[Any], case: str) -> None:
     found = result.summary["conclusion"]
     try:
         back, sentences = result.conclusion.to_dict(), result.sentences()
-    except Exception as error:
+    except RAISED as error:
         rule = "a conclusion must be read back from its JSON and say what was found"
         raise ContractError(f"{rule}, but raised {described(error)} ({case})") from error
     _require(to_json(back) == found, "a conclusion must go to JSON and back", f"{back} after {found} ({case})")
@@ -270,7 +270,7 @@ def _measured(metric: Metric, trace: Trace) -> float:
     """Return the value, finite."""
     try:
         value = float(metric(trace))
-    except Exception as error:
+    except RAISED as error:
         rule = "not change the trace" if "read-only" in str(error) else "measure every trace"
         raise ContractError(f"a metric must {rule}, but {metric.name} raised {error!r}") from error
     _require(math.isfinite(value), "a metric must be finite", f"{value} of {metric.name}")
@@ -326,7 +326,7 @@ def _check_predictor(predictor: Predictor, same: Predictor, at: Points, predicti
 def _predicted(predictor: Predictor, at: Points) -> Prediction:
     try:
         return predictor(at.copy())
-    except Exception as error:
+    except RAISED as error:
         raise ContractError(f"a predictor must take n = {len(at)} points, but raised {error!r}") from error
 
 
@@ -370,7 +370,7 @@ def _check_awkward_rows(fit: Callable[[Points, Vector], Predictor], u: Points, y
     for case, (rows, values) in cases.items():
         try:
             prediction = fit(rows, values)(at.copy())
-        except Exception as error:
+        except RAISED as error:
             raise ContractError(f"a metamodel must learn from {case}, but got {error!r}") from error
         _check_prediction(prediction, len(at), case)
     constant = _predicted(fit(u, np.full(len(y), 10.0)), at)
