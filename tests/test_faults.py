@@ -482,13 +482,18 @@ def test_a_full_disk_is_an_error_for_results_and_none_for_progress():
         assert progress.gone
 
 
-def test_a_stream_of_fewer_characters_gets_escapes():
-    """A terminal in ASCII ended a finished campaign with an internal error."""
-    inner = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+@pytest.mark.parametrize(
+    ("encoding", "errors", "name"),
+    [("ascii", "strict", b"\\udcff"), ("ascii", "surrogateescape", b"\xff"), ("utf-8", "surrogateescape", b"\xff")],
+)
+def test_a_stream_of_fewer_characters_gets_escapes(encoding: str, errors: str, name: bytes):
+    """A terminal in ASCII ended a finished campaign with an internal error; with errors as in the locale POSIX it still did."""
+    inner = io.TextIOWrapper(io.BytesIO(), encoding=encoding, errors=errors)
     stream = SteadyStream(inner)
-    stream.write("TTC \u2264 1 s")
+    stream.write("TTC \u2264 1 s \ud800 \udcff")
     stream.flush()
-    assert inner.buffer.getvalue() == b"TTC \\u2264 1 s"
+    at_most = "\u2264".encode(encoding, "backslashreplace")
+    assert inner.buffer.getvalue() == b"TTC " + at_most + b" 1 s \\ud800 " + name
 
 
 @pytest.mark.parametrize("ending", [[], ["--json"]])

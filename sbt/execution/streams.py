@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import errno
 import io
 import os
@@ -12,6 +13,19 @@ __all__ = ["SteadyStream", "UnwrittenError", "open_missing"]
 
 _GONE = (errno.EPIPE, errno.EBADF, errno.EIO, errno.ENXIO)
 """Errors of a stream whose reader has left: a closed pipe, descriptor or terminal."""
+_STEADY = {"strict": "backslashreplace", "surrogateescape": "sbt-escape"}
+"""By what a stream does with characters that its encoding lacks: what it does here; of ASCII or Latin-1, \\u2264 for ≤."""
+
+
+def _escaped(error: UnicodeError) -> tuple[str | bytes, int]:
+    """Return the bytes that stand in a name of a file, as surrogateescape does, else what stands for the characters."""
+    try:
+        return codecs.lookup_error("surrogateescape")(error)
+    except UnicodeError:
+        return codecs.lookup_error("backslashreplace")(error)
+
+
+codecs.register_error("sbt-escape", _escaped)
 
 
 class UnwrittenError(OSError):
@@ -28,8 +42,8 @@ class SteadyStream:
 
     def __init__(self, stream: TextIO, *, any_error: bool = False):
         self._stream, self._any = stream, any_error
-        if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
-            stream.reconfigure(errors="backslashreplace")  # of ASCII or Latin-1: \u2264 for ≤
+        if isinstance(stream, io.TextIOWrapper) and stream.errors in _STEADY:
+            stream.reconfigure(errors=_STEADY[stream.errors])
         self.gone = False
 
     def write(self, text: str) -> int:
