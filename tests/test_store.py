@@ -535,6 +535,14 @@ def test_of_a_truncated_store_doctor_says_what_can_be_done(finished: Path, tmp_p
     assert "malformed" not in told.output
 
 
+@pytest.mark.parametrize("verb", [["doctor", "--json"], ["doctor", "--save", "x"], ["status"], ["report"], ["bundle"]])
+def test_a_folder_that_is_no_store_is_wrong_input_for_every_verb(tmp_path: Path, verb: list[str]):
+    for folder in (tmp_path, tmp_path / "none"):
+        done = CliRunner().invoke(app, [verb[0], str(folder), *verb[1:]])
+        said = f"DIR must be the folder of a campaign (with campaign.sqlite), but got '{folder}'\n"
+        assert (done.exit_code, done.stdout, done.stderr) == (2, "", said)
+
+
 @pytest.mark.skipif(os.name != "posix", reason="other systems have another longest path")
 def test_a_path_that_sqlite_takes_no_longer_is_told_before_anything_is_made(tmp_path: Path):
     """It was told as a folder that is not writable, which was there then."""

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from sbt.cli.campaign import with_store
 from sbt.cli.console import Exit, clean_stdout, print_json
 from sbt.errors import InputError
 from sbt.plugins import KINDS
@@ -72,7 +73,7 @@ def doctor(
 ) -> None:
     """Check the environment (versions, SUMO, disk), or whether a store is whole; print advice where something is wrong."""
     if store is not None:
-        _examine_store(store, save, as_json=as_json)
+        _examine_store(with_store(store), save, as_json=as_json)
         return
     if save is not None:
         raise InputError("--save needs the store that is damaged: sumo-sbt doctor DIR --save NEW")
