@@ -81,6 +81,13 @@ RESULT: dict[str, Any] = {
     "conclusion": {"critical_fraction": 0.2222222, "validation": {"log_likelihood": -1.25, "rmse": None}},
 }  # fmt: skip
 
+ENDS = """
+import sbt
+
+ENDS = sbt.Scenario("ends", [sbt.Parameter("a", 0, 1)], sbt.Requirement("g", high=0.0), metrics=["g", "h"],
+                    evaluate=lambda values, seed: {"g": float("VALUE"), "h": 1.0})
+"""
+
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
@@ -340,6 +347,19 @@ def test_simulate_prints_one_json_object_and_nothing_else(folder: Path):
     assert (found["seed"], found["inputs"], found["critical"]) == (3, {"speed": 8.0, "gap": 3.0}, True)
     assert found["metrics"] == {"margin": 3.0 - 4.0 + 1e-3 * 3}
     assert "noise from C" in done.stderr
+
+
+@pytest.mark.parametrize(("value", "critical"), [("inf", False), ("-inf", True)])
+def test_json_tells_one_infinity_from_the_other(folder: Path, value: str, critical: bool):
+    """A critical run and one that is not had null both, without a word."""
+    (folder / "ends.py").write_text(ENDS.replace("VALUE", value))
+    simulated = json.loads(call("simulate", "ends.py:ENDS", "--json").stdout)
+    assert (simulated["metrics"], simulated["infinite"]) == ({"g": None, "h": 1.0}, {"g": value})
+    assert simulated["critical"] is critical
+    (folder / "e.yaml").write_text("campaign: coverage\nscenario: ends.py:ENDS\nbudget: 2\nexecutor: {kind: serial}\nstore: e\n")
+    call("run", "e.yaml", "--quiet")
+    replayed = json.loads(call("replay", "e", "0", "--json", "--trust").stdout)
+    assert (replayed["metrics"], replayed["infinite"]) == ({"g": None, "h": 1.0}, {"g": value})
 
 
 @pytest.mark.parametrize(

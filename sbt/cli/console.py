@@ -13,7 +13,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from enum import IntEnum
 from pathlib import Path
 from typing import Any, ParamSpec
@@ -26,7 +26,7 @@ from sbt.errors import InputError, SbtError
 from sbt.execution.streams import SteadyStream, UnwrittenError, open_missing
 
 __all__ = [
-    "Exit", "ProgressDisplay", "clean_stdout", "fail", "next_command", "print_json", "process", "resumable", "verb",
+    "Exit", "ProgressDisplay", "clean_stdout", "fail", "infinite", "next_command", "print_json", "process", "resumable", "verb",
 ]  # fmt: skip
 
 P = ParamSpec("P")
@@ -209,6 +209,12 @@ def clean_stdout() -> Iterator[None]:
 def print_json(value: Any) -> None:
     """Print one JSON object on one line of stdout; NaN and infinity become null."""
     print(json.dumps(_plain(value), allow_nan=False), flush=True)
+
+
+def infinite(metrics: Mapping[str, float]) -> dict[str, dict[str, str]]:
+    """Return what `--json` adds to metrics of which `print_json` makes null: which end of the scale each is at, by name."""
+    found = {name: f"{value}" for name, value in metrics.items() if math.isinf(value)}
+    return {"infinite": found} if found else {}
 
 
 def _plain(value: Any) -> Any:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sbt.cli.campaign import Folder, Trust, with_store
-from sbt.cli.console import Exit, clean_stdout, fail, next_command, print_json
+from sbt.cli.console import Exit, clean_stdout, fail, infinite, next_command, print_json
 
 if TYPE_CHECKING:
     from sbt.workflows.running import Replay
@@ -58,7 +58,7 @@ def replay(
         print_json({
             "run": record.index, "inputs": dict(record.inputs), "seed": record.seed, "status": str(outcome.status),
             "metrics": dict(outcome.metrics), "identical": verdict, "reason": outcome.reason,
-            "ended": states.ended if states is not None else "",
+            "ended": states.ended if states is not None else "", **infinite(outcome.metrics),
             **({"changed": changed} if changed else {}), **({"level": record.level} if record.level else {}),
             **({} if gif is None else {"film": str(gif.resolve())}),
             **({"unconfirmed": outcome.unconfirmed} if outcome.unconfirmed else {}),

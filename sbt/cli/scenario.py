@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from sbt.cli.completion import complete_scenarios
-from sbt.cli.console import Exit, clean_stdout, fail, next_command, print_json
+from sbt.cli.console import Exit, clean_stdout, fail, infinite, next_command, print_json
 from sbt.errors import InputError
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ def simulate(
         if trace is not None:
             _write_trace(trace, run)
     if as_json:
-        print_json(run.to_dict())
+        print_json({**run.to_dict(), **infinite(run.metrics)})
     else:
         _print_run(run)
         next_command("sumo-sbt", "check", scenario)
