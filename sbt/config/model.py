@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import (
@@ -41,7 +41,6 @@ __all__ = [
     "CorrelationEntry", "GateChoice", "InputChange", "Interval", "MetamodelChoice", "Name", "RequirementChange",
     "SimulationChoice", "StopRules", "ValidationChoice", "WarmStart",
 ]  # fmt: skip
-
 
 _LONGEST_FORMULA = 4096
 
@@ -105,7 +104,6 @@ class MetamodelChoice(Choice):
     preset: Name | None = Field(
         default=None, description="Named settings of the metamodel, such as paper; further keys override it."
     )
-
 
     @model_validator(mode="after")
     def _within_reason(self) -> MetamodelChoice:
@@ -255,7 +253,9 @@ class WarmStart(_Strict):
         return value
 
 
-def _unless_auto(value: Any) -> Any:
+def _or_auto(value: Any) -> Any:
+    if not (value is None or isinstance(value, bool) or value == "auto"):
+        raise ValueError(f"must be auto, true or false, but got {value!r}")
     return None if value == "auto" else value
 
 
@@ -316,7 +316,7 @@ class Configuration(_Strict):
     gate: GateChoice | None = Field(
         default=None, description="Estimation: pass, fail or undecided about a largest probability; null: no verdict."
     )
-    covariates: Annotated[bool | None, BeforeValidator(_unless_auto)] = Field(
+    covariates: Annotated[bool | None, BeforeValidator(_or_auto, json_schema_input_type=bool | Literal["auto"] | None)] = Field(
         default=None, description="Look at what the seed draws, before the run: auto (null), where the scenario tells it; "
         "true: also by a general set, an error where nothing can be told; false: never.",
     )  # fmt: skip
