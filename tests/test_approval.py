@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 
 import sbt
 from sbt import plugins
-from sbt.cli import app
+from sbt.cli import app, listing
 from sbt.plugins import approval
 from sbt.plugins.approval import UntrustedError
 from sbt.workflows.running import replay_run
@@ -238,3 +238,15 @@ def later():
     importlib.util.find_spec(f"{helper}_later")  # the folder has been looked at before
     what = [plugins.load("metrics", f"{evil}.py:{name}", tmp_path) for name in ("WHAT", "ALONE", "later")]
     assert (what[0], what[1], what[2]()) == ("source", None, "source")
+
+
+@pytest.mark.parametrize("value", ["state", "~/state", "./", ""])
+def test_folders_of_the_user_are_not_looked_for_in_the_working_directory(monkeypatch: pytest.MonkeyPatch, value: str):
+    """A folder of somebody else's could have brought approvals of its code."""
+    for name in ("XDG_STATE_HOME", "XDG_CACHE_HOME"):
+        monkeypatch.setenv(name, value)
+    home = Path.home()
+    assert (approval._state_file(), listing._folder()) == (home / ".local/state/sumo-sbt/approved", home / ".cache/sumo-sbt")
+    for name in ("XDG_STATE_HOME", "XDG_CACHE_HOME"):
+        monkeypatch.setenv(name, "/elsewhere")
+    assert (approval._state_file(), listing._folder()) == (Path("/elsewhere/sumo-sbt/approved"), Path("/elsewhere/sumo-sbt"))

@@ -42,7 +42,8 @@ def listed(kind: str) -> dict[str, str]:
 
 
 def _folder() -> Path:
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "sumo-sbt"
+    cache = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    return (cache if cache.is_absolute() else Path("~/.cache").expanduser()) / "sumo-sbt"
 
 
 def _state(kind: str) -> str:

@@ -138,8 +138,8 @@ def _lies_in_trusted(path: Path) -> bool:
 
 def _state_file() -> Path:
     """Return where approvals are kept, a line each: hash and path."""
-    state = os.environ.get("XDG_STATE_HOME")
-    return (Path(state) if state else Path.home() / ".local" / "state") / "sumo-sbt" / "approved"
+    state = Path(os.environ.get("XDG_STATE_HOME", ""))
+    return (state if state.is_absolute() else Path.home() / ".local" / "state") / "sumo-sbt" / "approved"
 
 
 @cache
