@@ -12,7 +12,7 @@ import pytest
 
 import sbt
 from sbt.campaigns.between import LIKELY, SURE, RunsBetween
-from sbt.campaigns.linking import LinksTold, connected, ways_in_noise
+from sbt.campaigns.linking import JoinedPart, LinksTold, connected, modes_counted, ways_in_noise
 from sbt.campaigns.rates import LocalRates, local_rates
 from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.problem.arrays import Mask, Points
@@ -89,6 +89,19 @@ def test_the_ways_that_are_asked_divide_modes_or_are_long_and_in_doubt():
     assert ways_in_noise(FLAT, ENDS[:2], at[:2], between(0.3, MIDDLE, ENDS[:2]), {}) == ([], 0)  # near
 
 
+def test_of_ways_within_a_mode_that_comes_first_which_joins_most_inputs_not_the_longest():
+    ends = np.array([[0.1, 0.1], [0.1, 0.15], [0.1, 0.2], [0.5, 0.1], [0.5, 0.15], [0.5, 0.2], [0.5, 0.2], [0.5, 0.9]])
+    ways, dividing = ways_in_noise(FLAT, ends, np.zeros(8), between(0.3, np.empty((0, 2)), ends), {})
+    assert dividing == 0
+    assert [set(way.sides[0]) | set(way.sides[1]) for way in ways] == [set(range(8)) - {6}] * 8  # one of each inputs
+    assert {frozenset(map(len, way.sides)) for way in ways[:2]} == {frozenset({3, 4})}
+    assert {frozenset(map(len, way.sides)) for way in ways} == {frozenset({3, 4}), frozenset({1, 6})}
+    for way in ways:
+        assert way.ends[0] in way.sides[0]
+        assert way.ends[1] in way.sides[1]
+    assert all(way.sides == () for way in ways_in_noise(FLAT, ENDS, np.zeros(4), between(0.3, MIDDLE[:10]), {})[0])  # divides
+
+
 def test_the_rate_of_a_small_region_is_not_that_of_all_runs():
     """Heavy noise: the length scales of the metric tell nothing of where runs fail."""
     found = []
@@ -129,3 +142,57 @@ def test_modes_may_be_fewer_where_too_few_runs_tell_of_a_way():
     said = LinksTold(9, 2, 4, dividing=1).sentence()
     assert said.endswith("; 4 ways between them are still in doubt, 1 of them between two modes.")
     assert not LinksTold(9, 2, 4).may_be_fewer
+
+
+@pytest.mark.parametrize(
+    ("dividing", "joining", "alone", "said"),
+    [
+        (None, None, 1, "3 distinct failure modes"),
+        (1, None, 0, "up to 3 distinct failure modes"),
+        (None, None, 2, "up to 3 distinct failure modes"),
+        (None, 2, 0, "at least 3 distinct failure modes"),
+        (1, 2, 0, "about 3 distinct failure modes (2 to 5)"),
+        (1, 2, 2, "about 3 distinct failure modes (1 to 5)"),
+    ],
+)
+def test_modes_are_at_least_so_many_where_ways_within_them_are_in_doubt(
+    dividing: int | None, joining: int | None, alone: int, said: str
+):  # fmt: skip
+    assert modes_counted(3, alone, LinksTold(9, 2, 4, dividing=dividing, joining=joining)) == said
+    assert modes_counted(3, 2, None) == "up to 3 distinct failure modes"
+
+
+def test_parts_of_modes_that_ways_in_doubt_join_are_named():
+    said = LinksTold(9, 2, 4, joining=4, parts=(JoinedPart(45, 13), JoinedPart(88, 4))).sentence()
+    assert "4 ways between them are still in doubt. Joined to others only by ways in doubt, and perhaps of modes of" in said
+    assert said.endswith(": run 45 (of 13 critical inputs), run 88 (of 4 critical inputs).")
+    assert "2 ways within modes are in doubt." in LinksTold(0, 0, 2, joining=2).sentence()
+
+
+BOXES = (((0.0, 0.0, 0.0), (0.4, 0.4, 1.0), 0.25), ((0.7, 0.7, 0.5), (1.0,) * 3, 0.9), ((0.6, 0.0, 0.0), (1.0, 0.3, 0.3), 0.5))
+
+
+def box(x: np.ndarray) -> int | None:
+    return next((k for k, (low, high, _) in enumerate(BOXES) if ((low <= x) & (x <= high)).all()), None)
+
+
+@pytest.mark.parametrize("seed", [102, 109])
+def test_a_region_that_is_joined_by_default_is_counted_and_named(seed: int, tmp_path: Path):
+    """Three boxes, and no failure between them: all are met, two modes are told."""
+
+    def evaluate(values: dict, run: int) -> dict:
+        k, (chance, depth) = box(np.array(list(values.values()))), np.random.default_rng(run).random(2)
+        return {"y": -0.1 - 1.5 * depth if k is not None and chance < BOXES[k][2] else 1.0 + 2.0 * depth}
+
+    inputs = [sbt.Parameter(name, 0.0, 1.0) for name in "abc"]
+    scenario = sbt.Scenario("boxes", inputs, sbt.Requirement("y", high=0.0), evaluate=evaluate, metrics=["y"])
+    keys = {"campaign": "falsification", "executor": "serial", "report": False, "judges": []}
+    result = sbt.run(scenario=scenario, budget=150, seed=seed, store=tmp_path / "s", **keys)
+    found, history = result.conclusion, result.history
+    at = {int(index): box(x) for index, x in zip(history.index, history.x, strict=True)}
+    assert len({at[run] for mode in found.failure_modes for run in mode.runs}) == 3 > len(found.failure_modes)
+    named = [mode.representative for mode in found.failure_modes] + [part.run for part in found.links.parts]
+    assert {at[run] for run in named} == {0, 1, 2}
+    said = result.sentences()
+    assert ("in at least 2 distinct" in said[0]) != ("in about 2 distinct failure modes (1 to " in said[0])
+    assert f"run {found.links.parts[0].run} (of {found.links.parts[0].inputs} critical inputs)" in " ".join(said)

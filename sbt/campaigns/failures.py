@@ -252,6 +252,7 @@ class FailureSearch:
         for mode in self.modes(known, raced, links_of(log)):
             again = history.where(confirmations(history, known.x[mode.representative], aside))
             modes.append(describe(mode, known, scenario, again, noisy=self.noisy(history)))
+        left, stand_for = self.ways_to_ask(log), [mode.representative for mode in modes]
         first, inputs = int(hits[0]) if len(hits) else None, self.critical_inputs(searched)
         bound = None if len(hits) else SearchBound.of(searched)
         return FalsificationConclusion(
@@ -261,7 +262,7 @@ class FailureSearch:
             stated_noise(history, scenario), violations(scenario.requirement, searched.where(margin <= 0)),
             None if fit is None else fit.independence,
             explained_variance(self.settings, history, (history.iteration == 0) | (history.stage == VALIDATION)),
-            raced=len(raced) or None, links=links_told(log, scenario.requirement, self.ways_to_ask(log)),
+            raced=len(raced) or None, links=links_told(log, scenario.requirement, left, stand_for),
             critical_inputs=inputs if inputs < len(hits) else None, crowded=crowded_inputs(scenario.space),
         )  # fmt: skip
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 
 from sbt.campaigns.between import LIKELY, SURE, RunsBetween
@@ -18,7 +20,10 @@ from sbt.samplers.search import WarpedModel
 from sbt.seeds import stream
 from sbt.store.records import optional
 
-__all__ = ["Link", "LinksTold", "Way", "connected", "doubtful", "pairs_joined", "unasked", "ways_between", "ways_in_noise"]
+__all__ = [
+    "JoinedPart", "Link", "LinksTold", "Way", "connected", "doubtful", "modes_counted", "pairs_joined", "unasked", "ways_between",
+    "ways_in_noise",
+]  # fmt: skip
 
 _PROBES = 9  # on the segment between two runs
 _CHUNK = 100  # segments asked for at once
@@ -31,6 +36,7 @@ _JOINED = 0.5  # least P(critical) of a way within a mode
 _SETTLED = 0.9  # how likely a way fails about as often as its ends, from which on no run is made on it
 _POINTS, _EDGE = 4, 0.25  # of a way in noise that are asked about at once; of its length at either end, where none is
 _GROUPS, _APART = 12, 24  # modes that are compared, and ways between two of them, the shortest
+_TOLD = 5  # parts in the sentence
 _BENDS, _REACH = 128, 0.5  # points over which such a way may lead, and how far from its middle, in its length
 
 
@@ -52,6 +58,7 @@ class Way:
         at: (d,) where that is, in the unit cube; of a way between two modes, the point over which it leads.
         untested: the metamodel is sure of it, but no run was made on it: it is long, or bends.
         nearest: it is between two modes, and one of the shortest that would make all of them one.
+        sides: with noise, of a way within a mode, those of the n on either side, one of each inputs, the likeliest to fail first.
     """
 
     ends: tuple[int, int]
@@ -59,11 +66,25 @@ class Way:
     at: Vector
     untested: bool
     nearest: bool = False
+    sides: tuple[tuple[int, ...], ...] = ()
 
     @property
     def excluded(self) -> bool:
         """Whether the metamodel excludes that the way is critical."""
         return self.least <= _DOUBT[0]
+
+
+@dataclass(frozen=True)
+class JoinedPart:
+    """A part of a mode of a noisy simulator that a way in doubt joins with the rest.
+
+    Attributes:
+        run: the likeliest to fail again, by the search.
+        inputs: different ones of its critical runs.
+    """
+
+    run: int
+    inputs: int
 
 
 @dataclass(frozen=True)
@@ -77,6 +98,8 @@ class LinksTold:
         lost: of the runs, those that gave no metric; None: all gave one.
         untested: shortest ways between modes on which no run was made: there may be fewer modes; None: there are none.
         dividing: ways in doubt between two modes: there may be fewer; None: there are none.
+        joining: of a noisy simulator, ways in doubt within modes: there may be more; None: there are none.
+        parts: what these join, where it is of several inputs, the most inputs first; None: there are none.
     """
 
     runs: int
@@ -85,6 +108,8 @@ class LinksTold:
     lost: int | None = optional()
     untested: int | None = optional()
     dividing: int | None = optional()
+    joining: int | None = optional()
+    parts: tuple[JoinedPart, ...] | None = optional()
 
     @property
     def may_be_fewer(self) -> bool:
@@ -94,14 +119,30 @@ class LinksTold:
     def sentence(self) -> str:
         """Return in words what was asked, and what remains open."""
         if self.runs == 0:
-            open_ = f"{plural(self.dividing or 0, 'way')} between modes {'is' if self.dividing == 1 else 'are'} in doubt"
-            return f"Too few runs between critical ones tell whether they are of one failure mode: {open_}."
+            open_, where = (self.left, "within") if self.dividing is None else (self.dividing, "between")
+            open_words = f"{plural(open_, 'way')} {where} modes {'is' if open_ == 1 else 'are'} in doubt"
+            return f"Too few runs between critical ones tell whether they are of one failure mode: {open_words}.{self._more()}"
         asked = f"{plural(self.runs, 'run')} between critical ones tested whether they are of one failure mode"
         found = f"{self.critical} {'was' if self.critical == 1 else 'were'} critical"
         found += "" if self.lost is None else f", {self.lost} gave no metric and {'tells' if self.lost == 1 else 'tell'} nothing"
         still = f"; {plural(self.left, 'way')} between them {'is' if self.left == 1 else 'are'} still in doubt"
         still += "" if self.dividing is None else f", {self.dividing} of them between two modes"
-        return f"{asked}: {found}{still if self.left else ''}."
+        return f"{asked}: {found}{still if self.left else ''}.{self._more()}"
+
+    def _more(self) -> str:
+        """Return which parts of modes may be modes of their own."""
+        told = ", ".join(f"run {part.run} (of {part.inputs} critical inputs)" for part in (self.parts or ())[:_TOLD])
+        return f" Joined to others only by ways in doubt, and perhaps of modes of their own: {told}." if told else ""
+
+
+def modes_counted(modes: int, alone: int, links: LinksTold | None) -> str:
+    """Return in words how many failure modes there are, `alone` of them of one input each."""
+    told, more = plural(modes, "distinct failure mode"), 0 if links is None else links.joining or 0
+    fewer = alone > 1 or (links is not None and links.may_be_fewer)
+    if fewer and more:
+        least = modes - max(alone - 1, 0) - (0 if links is None else links.dividing or 0)
+        return f"about {told} ({max(least, 1)} to {modes + more})"
+    return f"{'up to ' if fewer else 'at least ' if more else ''}{told}"
 
 
 Pairs = Sequence[tuple[int, int]]
@@ -181,8 +222,9 @@ def ways_in_noise(
 ) -> tuple[list[Way], int]:  # fmt: skip
     """Return the ways of a noisy simulator on which runs would tell whether two modes are one, and how many divide them in doubt.
 
-    They are the shortest that would make all modes one, in turn, whatever the metamodel says there, then those that join a mode,
-    the longest first; each with several points on it.
+    They are the shortest that would make all modes one, whatever the metamodel says there, and long ones that join a mode; each
+    with several points on it. Those points come first that may tell most: on ways most in doubt, with many inputs on either side,
+    and few other points.
 
     Args:
         fitted: as in `connected`.
@@ -194,22 +236,40 @@ def ways_in_noise(
     """
     group, joined = _linked(fitted, u, kind, cube, noisy=True, between=between)
     p, distance = fitted.probability(u), cdist(u, u)
+    same = np.unique(u, axis=0, return_inverse=True)[1].reshape(-1)
     parts = np.arange(len(u), dtype=np.int64)
-    found = list[tuple[int, int, float]]()
+    asked = list[tuple[float, list[Way]]]()
+
+    def ask(ends: tuple[int, int], likely: float, sides: tuple[Mask, Mask], *, within: bool) -> None:
+        runs = [np.flatnonzero(side) for side in sides]
+        runs = [rows[np.unique(same[rows], return_index=True)[1]] for rows in runs]
+        ranked = tuple(tuple(sorted(rows.tolist(), key=lambda k: (-between.rates.mean[k], k))) for rows in runs) if within else ()
+        points = _along(u, ends, likely, made.get(frozenset(ends), 0), cube)
+        asked.append((likely * (1.0 - likely) * min(map(len, runs)), [replace(way, sides=ranked) for way in points]))
+
     for i, j in joined:
         if distance[i, j] > _LONG:
             least = _JOINED * float(min(p[i], p[j]))
-            found.append((i, j, between.likely(i, j, (parts == parts[i], parts == parts[j]), least)))
+            likely = between.likely(i, j, (parts == parts[i], parts == parts[j]), least)
+            if likely < _SETTLED:
+                ask((i, j), likely, _sides(len(u), joined, (i, j)), within=True)
         parts[parts == parts[j]] = parts[i]
-    found.sort(key=lambda way: -float(distance[way[0], way[1]]))
     apart = sorted(_between_groups(group, kind, distance), key=lambda pair: float(distance[pair]))
-    tree = [(i, j) for i, j in apart if (i, j) in _tree(apart, group)]
-    likely = [between.likely(i, j, (group == group[i], group == group[j]), 0.0) for i, j in tree]
-    dividing = [(i, j, how) for (i, j), how in zip(tree, likely, strict=True) if how > SURE]
-    asked = [*dividing, *((i, j, how) for i, j, how in found if how < _SETTLED)]
-    ways = [list(_along(u, (i, j), how, made.get(frozenset((i, j)), 0), cube)) for i, j, how in asked]
-    first = [way for each in zip(*ways[: len(dividing)], strict=True) for way in each]
-    return [*first, *itertools.chain.from_iterable(ways[len(dividing) :])], len(dividing)
+    tree, dividing = _tree(apart, group), 0
+    for i, j in (pair for pair in apart if pair in tree):
+        sides = group == group[i], group == group[j]
+        if (likely := between.likely(i, j, sides, 0.0)) > SURE:
+            ask((i, j), likely, sides, within=False)
+            dividing += 1
+    told = [(-score / (1.0 + k), way) for score, points in asked for k, way in enumerate(points)]
+    return [way for _, way in sorted(told, key=lambda each: each[0])], dividing
+
+
+def _sides(n: int, joined: Sequence[tuple[int, int]], way: tuple[int, int]) -> tuple[Mask, Mask]:
+    """Return (n,) which runs are on either side of one of the ways that join n runs."""
+    first, second = np.array([pair for pair in joined if pair != way], dtype=np.intp).reshape(-1, 2).T
+    label = connected_components(coo_array((np.ones(len(first)), (first, second)), shape=(n, n)), directed=False)[1]
+    return label == label[way[0]], label == label[way[1]]
 
 
 def _along(u: Points, ends: tuple[int, int], likely: float, made: int, cube: Cube) -> Iterator[Way]:

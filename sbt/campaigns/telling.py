@@ -12,6 +12,7 @@ import numpy as np
 from sbt.campaigns.combinations import none_left
 from sbt.campaigns.counting import RANDOM, random_draws
 from sbt.campaigns.gate import CONDITION
+from sbt.campaigns.linking import modes_counted
 from sbt.campaigns.lost import (
     decides_bound,
     decides_share,
@@ -176,15 +177,14 @@ def tell_failures(found: FalsificationConclusion, random: CriticalShare, facts: 
         again = repetitions(round((often.confirmed or 0.0) * n), n, lost)
         worst += f"; run {often.representative} came back more often, in {again}"
     searched = int((facts.history.stage != CONFIRM).sum())
-    fewer = single(modes, facts.history) > 1 or (found.links is not None and found.links.may_be_fewer)
-    most = "up to " if fewer else ""
+    many = modes_counted(len(modes), single(modes, facts.history), found.links)
     between = ", with critical runs that were met on the way between them" if len(modes) > found.critical_runs else ""
     inputs = found.critical_inputs
     at = "" if inputs is None else ", all at one input" if inputs == 1 else f", at {inputs:,} different inputs"
     said = (
         f"The requirement{_of(facts)} is falsified: {found.critical_runs:,} of {plural(searched, 'run')} of the search"
         f" {'was' if found.critical_runs == 1 else 'were'} critical ({_condition(facts)}), the first after"
-        f" {plural(found.runs_to_first or 0, 'run')}{at}, in {most}{plural(len(modes), 'distinct failure mode')}{between}{worst}."
+        f" {plural(found.runs_to_first or 0, 'run')}{at}, in {many}{between}{worst}."
     )
     exhausted, silent = none_left(facts), "This does not tell how probable a failure is, since results chose the runs"
     silent += "" if exhausted else ", nor that there is no other mode"

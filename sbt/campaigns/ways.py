@@ -3,13 +3,24 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sbt.campaigns.beside import Links, batches_by
 from sbt.campaigns.between import RunsBetween
-from sbt.campaigns.linking import LinksTold, Way, connected, doubtful, pairs_joined, unasked, ways_between, ways_in_noise
+from sbt.campaigns.linking import (
+    JoinedPart,
+    LinksTold,
+    Way,
+    connected,
+    doubtful,
+    pairs_joined,
+    unasked,
+    ways_between,
+    ways_in_noise,
+)  # fmt: skip
 from sbt.campaigns.modes import critical_groups
 from sbt.campaigns.rates import LocalRates
 from sbt.campaigns.records import CONFIRM, LINK
@@ -20,6 +31,8 @@ from sbt.samplers.search import WarpedModel
 from sbt.store.history import History
 
 __all__ = ["OpenWays", "links_told", "open_ways", "runs_between"]
+
+_SEVERAL = 3  # critical inputs of a part of a mode that is told beside its representative
 
 
 @dataclass(frozen=True)
@@ -67,7 +80,9 @@ def open_ways(
 
     def told(ways: list[Way]) -> list[Way]:
         feasible = [way for way in ways if space.feasible(space.from_unit(way.at[None]))[0]]
-        return [replace(way, ends=(min(ends), max(ends))) for way in feasible for ends in [[runs[k] for k in way.ends]]]
+        sides = [tuple(tuple(runs[k] for k in side) for side in way.sides) for way in feasible]
+        ends = [sorted(runs[k] for k in way.ends) for way in feasible]
+        return [replace(way, ends=(i, j), sides=both) for way, (i, j), both in zip(feasible, ends, sides, strict=True)]
 
     if between is not None:
         place = {run: k for k, run in enumerate(runs)}
@@ -81,11 +96,32 @@ def open_ways(
     return OpenWays(told(doubt), unasked(told(ways), links), sum(group[way.ends[0]] != group[way.ends[1]] for way in doubt))
 
 
-def links_told(log: Log, requirement: Requirement, ways: OpenWays) -> LinksTold | None:
-    """Return what runs between critical ones told; None where there was none, and no way divides two modes in doubt."""
+def links_told(log: Log, requirement: Requirement, ways: OpenWays, representatives: Collection[int] = ()) -> LinksTold | None:
+    """Return what runs between critical ones told; None where there was none, and no way is in doubt on which count rests.
+
+    Args:
+        log: of the campaign.
+        requirement: of its scenario.
+        ways: what remains open.
+        representatives: runs that stand for the modes.
+    """
     asked = log.history.where(np.isin(log.history.iteration, batches_by(log, LINK)))
-    if not len(asked) and not ways.dividing:
+    joining = {way.ends: way.sides for way in ways.doubtful if way.sides}
+    if not len(asked) and not ways.dividing and not joining:
         return None
     critical, open_ = int(requirement.critical_runs(asked).sum()), ways.unasked
     left = len({way.ends for way in ways.doubtful}) + sum(way.excluded for way in open_)
-    return LinksTold(len(asked), critical, left, int((~asked.ok).sum()) or None, len(open_) or None, ways.dividing or None)
+    return LinksTold(
+        len(asked), critical, left, int((~asked.ok).sum()) or None, len(open_) or None, ways.dividing or None,
+        len(joining) or None, _parts(list(joining.values()), representatives) or None,
+    )  # fmt: skip
+
+
+def _parts(joined: Sequence[tuple[tuple[int, ...], ...]], representatives: Collection[int]) -> tuple[JoinedPart, ...]:
+    """Return the sides of ways within modes, of several inputs each, that no representative stands for."""
+    found = dict[int, int]()
+    for sides in joined:
+        side = min(sides, key=lambda runs: (not set(runs).isdisjoint(representatives), len(runs)))
+        if len(side) >= _SEVERAL:
+            found[side[0]] = max(len(side), found.get(side[0], 0))
+    return tuple(JoinedPart(run, inputs) for run, inputs in sorted(found.items(), key=lambda part: -part[1]))
