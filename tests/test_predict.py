@@ -55,6 +55,22 @@ def test_it_is_the_belief_of_the_campaign(store):
     assert found["rows"][0]["p_critical"] > 0.9 > 0.1 > found["rows"][1]["p_critical"]
 
 
+def test_it_says_how_likely_a_run_gives_no_metric_where_some_gave_none(tmp_path):
+    def simulate(values, seed):
+        if values["a"] > 0.6:
+            raise sbt.RunError("failed", "it does not start")
+        return {"g": values["b"] - 0.5}
+
+    inputs = [sbt.Parameter("a", 0, 1), sbt.Parameter("b", 0, 1)]
+    scenario = sbt.Scenario("fails", inputs, sbt.Requirement("g", high=0.0), evaluate=simulate, metric_names=("g",))
+    found = sbt.run(
+        campaign="coverage", scenario=scenario, budget=60, metamodel="gp", store=tmp_path / "s", executor="serial", report=False
+    )
+    told = found.predict({"a": [0.1, 0.5, 0.7, 0.95], "b": [0.9, 0.1, 0.1, 0.9]})
+    assert ((told["p_fails"] > 0.5) == [False, False, True, True]).all()
+    assert told["p_fails"].between(0.0, 1.0).all()
+
+
 def test_it_is_fitted_once_for_the_same_rows(store, campaign):
     first, second = predicted(store), predicted(store)
     assert (first["source"], second["source"]) == ("fitted", "loaded")

@@ -51,7 +51,7 @@ class Table:
         space: the inputs.
         x: (n, d) their numbers.
         columns: (n,) mu, sigma, epistemic, noise (unit of the metric) and p_critical; of a combination those of its margin, and
-            p_critical.NAME for each requirement.
+            p_critical.NAME for each requirement; p_fails, P(a run gives no metric), where some gave none.
         metric: the safety metric.
         metamodel: kind, as configured.
         learned: runs that it learned from.
@@ -134,6 +134,8 @@ def predict_inputs(
     each_of = requirement.parts if requirement.combined else ()
     names = ("mu", "sigma", "epistemic", "noise", "p_critical", *(f"p_critical.{part.label}" for part in each_of))
     columns = dict(zip(names, np.concatenate(parts, axis=1), strict=True)) if parts else {n: np.empty(0) for n in names}
+    if (success := learner.success(history)) is not None:
+        columns["p_fails"] = -np.expm1(success(space.to_unit(x)))
     return Table(space, x, columns, requirement.told_as, choice.kind, len(training), source, ignored)
 
 

@@ -168,7 +168,8 @@ class Result(Generic[C]):
             device: auto, cpu or cuda; None: where the metamodel was fitted.
 
         Returns:
-            Columns mean, std, epistemic, noise (unit of the metric) and p_critical, with the rows' index.
+            Columns mean, std, epistemic, noise (unit of the metric) and p_critical, with the rows' index. Where some runs gave
+            no metric also p_fails, the probability of that: the others are of a run that gives one.
 
         Raises:
             InputError: a column is missing, a value is outside of its range, or there is no metamodel.
