@@ -315,6 +315,9 @@ def test_stops_where_little_is_expected_on_the_wrong_side(tmp_path: Path):
     assert result["stopped"] == "misclassified"
     assert result["runs"] < 400
     assert result["conclusion"]["expected_misclassified"] <= 0.012
+    even = result["conclusion"]["even_fraction"]["counted"]  # in doubt, and excluded as far as no even run denied it
+    assert even >= 100
+    assert result["conclusion"]["expected_misclassified"] + 0.5 / (even + 1.0) <= 0.01
 
 
 CONE = """

@@ -29,7 +29,7 @@ from sbt.samplers.smc import smc
 from sbt.samplers.sobol import SobolSequence
 from sbt.seeds import stream
 
-__all__ = ["ChoiceRule", "Chosen", "evenly", "from_roi", "greedily", "mixed"]
+__all__ = ["ChoiceRule", "Chosen", "evenly", "filling", "from_roi", "greedily", "mixed"]
 
 _MAX_REJECTION_CANDIDATES = 2**14  # that the mix looks at before it turns to particles: about a second with a GP
 _MOST_EVEN = 2**23  # where none is scored: 8,000 runs of a space of which constraints leave a thousandth
@@ -61,6 +61,12 @@ def evenly(settings: Settings, fitted: FittedMetamodel | None, log: Log, n: int)
     del fitted
     draw, x = _draw(settings, None, even, log, n)
     return Chosen(x, _proposal(draw))
+
+
+def filling(settings: Settings, fitted: FittedMetamodel | None, log: Log, n: int) -> Chosen:
+    """Return what `evenly` does, as runs that fill the space."""
+    chosen = evenly(settings, fitted, log, n)
+    return replace(chosen, proposal=replace(chosen.proposal, filling=n))
 
 
 def from_roi(settings: Settings, fitted: FittedMetamodel | None, log: Log, n: int) -> Chosen:
@@ -109,8 +115,8 @@ def mixed(settings: Settings, fitted: FittedMetamodel | None, log: Log, n: int) 
     looking = explore(settings, log, min(_rounded(share * n, log), n))
     opened = _MOST_FILLING * _open_share(settings, fitted, log)
     filled = max(_FILLING, opened, _settled(fitted, log), alike, _lost(fitted, log))
-    filling = min(_rounded(max(filled - settings.holdout_fraction, 0.0) * n, log), n - len(looking))
-    first, fill = _draw(settings, fitted, even, log, filling, taken=looking)
+    even_runs = min(_rounded(max(filled - settings.holdout_fraction, 0.0) * n, log), n - len(looking))
+    first, fill = _draw(settings, fitted, even, log, even_runs, taken=looking)
     so_far = np.concatenate([looking, fill])
     second, typical = _typical(settings, fitted, log, _rounded(_TYPICAL * (n - len(so_far)), log), so_far, first.next_position)
     so_far = np.concatenate([so_far, typical])

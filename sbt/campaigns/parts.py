@@ -9,16 +9,17 @@ from itertools import pairwise
 
 import numpy as np
 
-from sbt.campaigns.choices import ChoiceRule, evenly
+from sbt.campaigns.choices import ChoiceRule, evenly, filling
 from sbt.campaigns.clustering import clustered_interval
 from sbt.campaigns.combinations import ALL_RUN, all_run, few, without_repetition
 from sbt.campaigns.exploration import space_filling
 from sbt.campaigns.repeats import repeats_wanted
 from sbt.campaigns.settings import Settings
 from sbt.campaigns.sides import all_critical, few_of_a_side, none_critical
+from sbt.campaigns.unforeseen import lacking, unforeseen_share
 from sbt.campaigns.wording import percent, plural
 from sbt.estimators.binomial import interval, upper
-from sbt.loop.learner import changed_share
+from sbt.loop.learner import FittedMetamodel, changed_share
 from sbt.loop.stages import Batch, Facts, Log
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.plain import Value
@@ -109,7 +110,7 @@ class BatchStage:
             return "no rows left"
         if log.iterations and self.repeats and all_run(s.scenario, log.planned):
             return ALL_RUN
-        chose = [fit for fit in log.fits if fit.iteration < log.iteration]  # a concluding fit chose no batch
+        chose = _chose(log)
         stable = s.stop.get("stable")
         if stable is not None and len(chose) >= 3:
             sides = [fit.sides for fit in chose[-3:]]
@@ -119,12 +120,24 @@ class BatchStage:
         return "misclassified" if self._sure(chose[-2:], log) else None
 
     def _sure(self, fits: Sequence[FitRecord], log: Log) -> bool:
-        """Say whether three fits in turn expect so little of the space on the wrong side and agree, and no run denies it.
+        """Say whether fits that agree may end the campaign: the newest runs and those that fill the space do not deny them."""
+        learner, target = self.settings.learner, self.settings.stop.get("misclassified")
+        if learner is None or target is None or not self._agreed(fits, log, target):
+            return False
+        learned = learner.fit(log.history)
+        if learned is None or not self._confirmed(fits, learned, target):
+            return False
+        if lacking(self.settings, log, learner, target):
+            return False
+        left = target - learned.record.expected_misclassified
+        return unforeseen_share(self.settings, log, learner, learned, left) <= left
+
+    def _agreed(self, fits: Sequence[FitRecord], log: Log, target: float) -> bool:
+        """Say whether two fits in turn expect so little of the space on the wrong side and agree, and no run denies it.
 
         Held-out runs do not. Several runs tell of each side, or those that fill the space evenly bound what none has met.
         """
-        target = self.settings.stop.get("misclassified")
-        if target is None or len(fits) < 2 or max(fit.expected_misclassified for fit in fits) > target:
+        if len(fits) < 2 or max(fit.expected_misclassified for fit in fits) > target:
             return False
         validation = fits[-1].validation
         if validation is None or validation.error_rate is None or changed_share(fits[0].sides, fits[1].sides) > target:
@@ -132,32 +145,45 @@ class BatchStage:
         wrong = round(validation.error_rate * validation.n)
         if interval(wrong, validation.n)[0] > fits[-1].expected_misclassified:
             return False  # the conclusion would say that they deny its figures
-        if not _both_sides_known(log, self.settings.scenario, target):
-            return False
-        learned = None if self.settings.learner is None else self.settings.learner.fit(log.history)
-        if learned is None or learned.record.expected_misclassified > target:
-            return False  # the newest runs, which no fit has learned from yet, deny it
-        return changed_share(fits[1].sides, learned.record.sides) <= target
+        return _both_sides_known(log, self.settings.scenario, target)
+
+    def _confirmed(self, fits: Sequence[FitRecord], learned: FittedMetamodel, target: float) -> bool:
+        """Say whether the fit to all runs, of which the newest taught none before, expects and tells the same."""
+        newest = learned.record
+        return newest.expected_misclassified <= target and changed_share(fits[-1].sides, newest.sides) <= target
+
+    def _missing(self, fitted: FittedMetamodel | None, log: Log) -> int:
+        """Return how many runs that fill the space a stop rule asks for before anything else; 0: it does not."""
+        s, target, fits = self.settings, self.settings.stop.get("misclassified"), _chose(log)[-2:]
+        if s.learner is None or target is None or fitted is None or not self._agreed(fits, log, target):
+            return 0
+        return lacking(s, log, s.learner, target) if self._confirmed(fits, fitted, target) else 0
 
     def propose(self, log: Log) -> Batch:
         """Return the next batch."""
         s, first = self.settings, log.iteration == 0
         spent = len(log.planned) - (0 if first else s.reference)
+        fitted = s.learner.fit(log.history) if s.learner is not None and not first else None
+        missing = self._missing(fitted, log)
         batch = s.batch if self.most is None or first else self.most(s, log)
-        size = min(s.initial if first else batch, s.budget - spent)
+        size = min(s.initial if first else min(batch, missing or batch), s.budget - spent)
         held_out = math.floor(s.holdout_fraction * (spent + size)) - math.floor(s.holdout_fraction * spent)
         held_out = min(held_out, size - 1) if size > 1 else 0
         held_out = 0 if self.repeats and few(s.scenario, log.planned, s.budget) else held_out
-        fitted = s.learner.fit(log.history) if s.learner is not None and not first else None
         again = () if first or not self.repeats else repeats_wanted(log.planned, s.scenario, size - held_out)
         n = size - held_out - len(again)
-        found = (evenly if first or n == 0 else self.choose)(s, fitted, log, n)
+        found = (evenly if first or n == 0 else filling if missing else self.choose)(s, fitted, log, n)
         stage = "initial" if first else self.name
         x = without_repetition(s.scenario, log.planned, found.x) if self.repeats else found.x
         chosen = PlannedPoints(stage, x, s.scenario.space.names, s.scenario.space.choices)
         random = held_out_runs(s, log.iteration, held_out + (s.reference if first else 0))
         proposal = replace(found.proposal, held_out=len(random), repeats=len(again) or None)
         return Batch((*chosen, *again, *random) if again or random else chosen, proposal, fitted)
+
+
+def _chose(log: Log) -> list[FitRecord]:
+    """Return the fits that chose a batch, as a concluding one did not."""
+    return [fit for fit in log.fits if fit.iteration < log.iteration]
 
 
 def _both_sides_known(log: Log, scenario: LogicalScenario, target: float) -> bool:

@@ -182,7 +182,7 @@ class StopRules(_Strict):
     stable: float | None = Field(default=None, gt=0, lt=1, description="Boundary: share of the space that still changes sides.")
     misclassified: float | None = Field(
         default=None, gt=0, lt=1,
-        description="Boundary: expected share of the space on the wrong side, not denied by held-out runs.",
+        description="Boundary: expected share of the space on the wrong side, not denied by runs that fill it.",
     )  # fmt: skip
     cov: float | None = Field(default=None, gt=0, allow_inf_nan=False, description="Estimation: coefficient of variation.")
 
