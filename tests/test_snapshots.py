@@ -546,11 +546,26 @@ def test_memories_that_states_do_not_hold_are_not_warmed_up(tmp_path, what):
     assert (found.level, bool(re.search(said, found.why))) == ("fresh", True)
 
 
+def test_devices_that_nobody_has_are_no_reason_to_load(tmp_path):
+    """Options that only say how such a device works, as templates of SUMO's options have them, and devices that are off."""
+    options = "device.glosa.range: 50, device.driverstate.errorTimeScaleCoefficient: 50, device.toc.probability: '-1'"
+    off = "".join(
+        f'<param key="{key}" value="{value}"/>'
+        for key, value in (("has.glosa.device", "false"), ("device.bluelight.probability", "0.0"), ("has.btsender.device", "0"))
+    )
+    more = f'<vType id="g">{off}</vType><trip id="x" type="g" {NINE}/>'
+    assert simulation(town(tmp_path, depart="130", warm_up="", options=options, more=more)).isolation.level == "snapshot"
+
+
 def test_trains_and_level_crossings_are_not_warmed_up_together(tmp_path):
     """SUMO: a closed crossing was yellow for 5 s more at t0, with the train on it."""
     train = f'<vType id="r" vClass="rail_urban"/><trip id="x" type="r" {NINE}/>'
     assert simulation(town(tmp_path / "none", warm_up="", depart="130", more=train)).isolation.level == "snapshot"
     path, net = town(tmp_path, warm_up="", depart="130", more=train), tmp_path / "town.net.xml"
+    net.write_text(net.read_text().replace("</net>", '<!-- <junction type="rail_crossing"/> --></net>'))
+    assert "level crossings" in simulation(path).isolation.why
+    more = f'<trip id="x" type="DEFAULT_RAILTYPE" {NINE}/>'
+    path, net = town(tmp_path / "default", warm_up="", depart="130", more=more), tmp_path / "default" / "town.net.xml"
     net.write_text(net.read_text().replace("</net>", '<!-- <junction type="rail_crossing"/> --></net>'))
     assert "level crossings" in simulation(path).isolation.why
 

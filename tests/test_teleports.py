@@ -215,6 +215,7 @@ def test_a_road_that_goes_on_without_a_gap_needs_no_lanes_inside_its_junction(tm
     scenario = ScenarioSpec(str(tmp_path / "with.yaml")).resolve()
     outcome = run_job(scenario, Job(0, {"tau": 1.0}, 1))
     assert (outcome.status, outcome.unconfirmed) == ("ok", "")
+    assert not any("inside junctions" in said for said in scenario.simulate.warnings())
     ego = scenario.simulate({"tau": 1.0}, 1).actor("ego")
     assert np.ptp(ego.y) > 2.0, "it has changed lanes"
     assert ego.x[-1] > 110.0

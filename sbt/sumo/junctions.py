@@ -60,10 +60,16 @@ class Junctions:
 
 
 def told_of_junctions(sumo: Any) -> str:
-    """Return in words that the network that SUMO has loaded has junctions, and no lanes inside them; "" elsewhere."""
-    if not Junctions(sumo).lack_lanes or not any(sumo.lane.getLinkNumber(lane) for lane in sumo.lane.getIDList()):
+    """Return in words that SUMO's network has junctions of some width, and no lanes inside them; "" elsewhere."""
+    if not Junctions(sumo).lack_lanes or not any(_ends_before_next(sumo.lane, lane) for lane in sumo.lane.getIDList()):
         return ""
     return (
         "the network has no lanes inside junctions, so that SUMO moves road users over one within a step: an ego there"
         f" makes its run invalid, and the tracks of others are interrupted there; {_REMEDY}"
     )
+
+
+def _ends_before_next(lanes: Any, lane: str) -> bool:
+    """Return whether there is a gap between a lane and one that follows it."""
+    end = lanes.getShape(lane)[-1]
+    return any(math.dist(end, lanes.getShape(link[0])[0]) > _FURTHER for link in lanes.getLinks(lane))

@@ -42,18 +42,22 @@ _RED = "a saved state does not hold since when lights are red: whoever may drive
 _DELAY = "a saved state does not hold who has yet to start (startupDelay): a queue would start at once"
 _CROSSING = "a saved state does not hold that level crossings are closed (rail_crossing), and '{}' may be a train"
 _HOW_IT_WALKS = re.compile(rb"<(walk|personTrip)\b[^>]*\b(speed|duration)=")
-_EQUIPPED = re.compile(rb"\b(?:has\.(\w+)\.device|device\.(\w+)\.probability)\b")
+_PARAMETER = re.compile(rb"<param\b[^>]*>")
+_KEY = re.compile(rb"\bkey\s*=\s*[\"'](?:has\.(\w+)\.device|device\.(\w+)\.probability)[\"']")
+_NONE = re.compile(rb"\bvalue\s*=\s*[\"']\s*(?:false|no|off|f|x|-?[0.]+|-[\d.]+)?\s*[\"']", re.IGNORECASE)
+"""The value of one that equips nobody."""
 _RUNS_RED = re.compile(rb"\bjmDriveAfterRedTime\s*=\s*[\"'](?!-)")
 _STARTS_LATE = re.compile(rb"\bstartupDelay\s*=\s*[\"'](?!0*\.?0*[\"'])")
-_ON_RAILS = re.compile(rb"\bvClass\s*=\s*[\"'](?:rail|tram|subway)")
+_ON_RAILS = re.compile(rb"\bvClass\s*=\s*[\"'](?:rail|tram|subway)|[\"']DEFAULT_RAILTYPE[\"']")
 
 
 def lost_by_option(name: str, value: str) -> str:
     """Return why no run of an option can begin with a saved state; "" where one can."""
     if name in _FORBIDDEN and value != _FORBIDDEN[name]:
         return f"runs with the option {name} {value} load their traffic"
-    device = name.split(".")[1] if name.startswith("device.") else ""
-    if device in _DEVICES:
+    device, _, what = name.removeprefix("device.").partition(".") if name.startswith("device.") else ("", "", "")
+    equips = (what == "probability" and not _NONE.search(f'value="{value}"'.encode())) or (what == "explicit" and value != "")
+    if device in _DEVICES and equips:
         return f"{_DEVICES[device]}, as the option {name} has it"
     if name == "lanechange.duration" and seconds_of(value) != 0.0:
         return f"a saved state does not hold lane changes that take time (lanechange.duration {value})"
@@ -106,8 +110,9 @@ def lost_in_traffic(before: Iterable[Piece], definitions: Iterable[Piece], net: 
 
 def _lost_of(piece: Piece, text: bytes) -> str:
     """Return what a state lacks of one element: over which edges it drives, with what, and what its driver remembers."""
-    for match in _EQUIPPED.finditer(text):
-        if (device := (match[1] or match[2]).decode()) in _DEVICES:
+    for parameter in _PARAMETER.findall(text):
+        key = _KEY.search(parameter)
+        if key and (device := (key[1] or key[2]).decode()) in _DEVICES and not _NONE.search(parameter):
             return _DEVICES[device]
     if _RUNS_RED.search(text):
         return _RED
