@@ -80,7 +80,7 @@ def stepping(found: UserSimulation, seconds: float) -> tuple[float, float, int, 
 
     def work() -> tuple[float, float, int, float]:
         begun = time.process_time()
-        with session().run(warmed.launch, 0, SNAPSHOT, state) as sumo:
+        with session().run(warmed.launch, 0, SNAPSHOT, lambda: state) as sumo:
             loaded = time.process_time()
             for _ in range(round(seconds / 0.1)):
                 sumo.simulationStep()

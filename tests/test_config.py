@@ -176,6 +176,7 @@ def test_all_errors_at_once_each_at_its_place():
         ("seed: 1\nseed: 2", "f.yaml:4:1: seed: a key must stand once in its mapping, but 'seed' stands already in line 3"),
         ("covariates: yes", "f.yaml:3:13: covariates: must be auto, true or false, but got 'yes'"),
         ("warm_start: {store: s, transfer: yes}", "f.yaml:3:34: warm_start.transfer: must be true or false, but got 'yes'"),
+        ("=: 2", "f.yaml:3:1: =: unknown key"),
         ("1: 2", "f.yaml:3:1: 1: keys must be text, but got 1"),
         ("seed: 1\nnull: 2", "f.yaml:4:1: None: keys must be text, but got null"),
         ("seed: 1\n0x10: 2", "f.yaml:4:1: 16: keys must be text, but got 16"),

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from own_networks import run_program
@@ -13,6 +14,7 @@ from own_networks import run_program
 from sbt.execution.spec import ScenarioSpec
 from sbt.execution.worker import run_job
 from sbt.problem.outcome import Job, Outcome
+from sbt.sumo.leaving import Leaving
 
 NODES = '<nodes><node id="a" x="0" y="0"/><node id="b" x="200" y="0"/><node id="c" x="212" y="0"/><node id="d" x="212" y="190"/></nodes>'
 EDGES = '<edges><edge id="ab" from="a" to="b" numLanes="1"/><edge id="bc" from="b" to="c" numLanes="1"/><edge id="cd" from="c" to="d" numLanes="1"/></edges>'
@@ -91,3 +93,31 @@ def test_an_ego_at_the_end_of_its_route_has_arrived(tmp_path: Path, network: Pat
     assert outcome.status == "ok", outcome.reason
     (tmp_path / "must").mkdir()
     assert "make the route longer" in _run(tmp_path / "must", network, ego, step=step, may=False).reason
+
+
+@pytest.mark.parametrize(
+    ("road", "lane", "position", "waited", "removes", "said"),
+    [
+        ("cd", "cd_0", 99.9, 9.0, "true", ""),  # it stood there, but not until SUMO removes it
+        ("cd", "cd_0", 99.9, 20.0, "true", "from a jam, 100 m along 'cd'"),
+        ("dc", "dc_0", 0.5, 0.0, "false", ""),  # on the opposite lane, along which its position is
+        ("cd", "cd_0", 0.5, 0.0, "false", "cut to end 0 m along 'cd'"),
+        (":c", ":c_0", 1.0, 0.0, "false", "removed in the junction behind 'cd', before the end of its route on 'ef'"),
+    ],
+)
+def test_who_stood_or_overtook_at_its_end_has_arrived(road: str, lane: str, position: float, waited: float, removes: str, said: str):
+    options = {"time-to-teleport": "20", "time-to-teleport.highways": "0", "time-to-teleport.disconnected": "-1"}
+    route = ("ab", "cd", "ef") if road == ":c" else ("ab", "cd")
+    vehicle = SimpleNamespace(
+        getRouteID=lambda ego: "r", getRoute=lambda ego: route, getWaitingTime=lambda ego: waited, getRouteIndex=lambda ego: 1,
+        getLanePosition=lambda ego: position, getRoadID=lambda ego: road, getLaneID=lambda ego: lane,
+    )  # fmt: skip
+    sumo = SimpleNamespace(
+        vehicle=vehicle, lane=SimpleNamespace(getLength=lambda lane: 100.0),
+        simulation=SimpleNamespace(getOption=lambda name: options.get(name, removes)),
+    )  # fmt: skip
+    leaving = Leaving(sumo, "ego", ("max", None))
+    leaving.look()
+    found = leaving.why_removed(0.0, 0.1)
+    assert said in found
+    assert bool(found) == bool(said)

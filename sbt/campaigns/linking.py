@@ -58,7 +58,8 @@ class Way:
         at: (d,) where that is, in the unit cube; of a way between two modes, the point over which it leads.
         untested: the metamodel is sure of it, but no run was made on it: it is long, or bends.
         nearest: it is between two modes, and one of the shortest that would make all of them one.
-        sides: with noise, of a way within a mode, those of the n on either side, one of each inputs, the likeliest to fail first.
+        sides: with noise, of a way within a mode, what it joins: those of the n on either side that no other such way is needed
+            for, the likeliest to fail first.
     """
 
     ends: tuple[int, int]
@@ -238,38 +239,48 @@ def ways_in_noise(
     p, distance = fitted.probability(u), cdist(u, u)
     same = np.unique(u, axis=0, return_inverse=True)[1].reshape(-1)
     parts = np.arange(len(u), dtype=np.int64)
-    asked = list[tuple[float, list[Way]]]()
+    asked, within = list[tuple[float, list[Way]]](), list[tuple[int, int]]()
 
-    def ask(ends: tuple[int, int], likely: float, sides: tuple[Mask, Mask], *, within: bool) -> None:
-        runs = [np.flatnonzero(side) for side in sides]
-        runs = [rows[np.unique(same[rows], return_index=True)[1]] for rows in runs]
-        ranked = tuple(tuple(sorted(rows.tolist(), key=lambda k: (-between.rates.mean[k], k))) for rows in runs) if within else ()
-        points = _along(u, ends, likely, made.get(frozenset(ends), 0), cube)
-        asked.append((likely * (1.0 - likely) * min(map(len, runs)), [replace(way, sides=ranked) for way in points]))
+    def ask(ends: tuple[int, int], likely: float, sides: tuple[Mask, Mask]) -> None:
+        inputs = min(len(np.unique(same[side])) for side in sides)
+        points = list(_along(u, ends, likely, made.get(frozenset(ends), 0), cube))
+        asked.append((likely * (1.0 - likely) * inputs, points))
 
     for i, j in joined:
         if distance[i, j] > _LONG:
             least = _JOINED * float(min(p[i], p[j]))
             likely = between.likely(i, j, (parts == parts[i], parts == parts[j]), least)
             if likely < _SETTLED:
-                ask((i, j), likely, _sides(len(u), joined, (i, j)), within=True)
+                within.append((i, j))
+                ask((i, j), likely, _sides(len(u), joined, (i, j)))
         parts[parts == parts[j]] = parts[i]
     apart = sorted(_between_groups(group, kind, distance), key=lambda pair: float(distance[pair]))
     tree, dividing = _tree(apart, group), 0
     for i, j in (pair for pair in apart if pair in tree):
         sides = group == group[i], group == group[j]
         if (likely := between.likely(i, j, sides, 0.0)) > SURE:
-            ask((i, j), likely, sides, within=False)
+            ask((i, j), likely, sides)
             dividing += 1
+    label, kept = _labels(len(u), [pair for pair in joined if pair not in within]), dict[int, tuple[int, ...]]()
+    for part in np.unique(label[np.array(within, dtype=np.intp).reshape(-1)]).tolist():
+        kept[part] = tuple(sorted(np.flatnonzero(label == part).tolist(), key=lambda k: (-between.rates.mean[k], k)))
+
     told = [(-score / (1.0 + k), way) for score, points in asked for k, way in enumerate(points)]
-    return [way for _, way in sorted(told, key=lambda each: each[0])], dividing
+    ways = [way for _, way in sorted(told, key=lambda each: each[0])]
+    inside = {ends: tuple(kept[label[end]] for end in ends) for ends in within}
+    return [replace(way, sides=inside.get(way.ends, ())) for way in ways], dividing
 
 
 def _sides(n: int, joined: Sequence[tuple[int, int]], way: tuple[int, int]) -> tuple[Mask, Mask]:
     """Return (n,) which runs are on either side of one of the ways that join n runs."""
-    first, second = np.array([pair for pair in joined if pair != way], dtype=np.intp).reshape(-1, 2).T
-    label = connected_components(coo_array((np.ones(len(first)), (first, second)), shape=(n, n)), directed=False)[1]
+    label = _labels(n, [pair for pair in joined if pair != way])
     return label == label[way[0]], label == label[way[1]]
+
+
+def _labels(n: int, pairs: Pairs) -> NDArray[np.int64]:
+    """Return (n,) numbers from 0, the same for runs that pairs of them join."""
+    first, second = np.array(pairs, dtype=np.intp).reshape(-1, 2).T
+    return np.asarray(connected_components(coo_array((np.ones(len(first)), (first, second)), shape=(n, n)))[1], dtype=np.int64)
 
 
 def _along(u: Points, ends: tuple[int, int], likely: float, made: int, cube: Cube) -> Iterator[Way]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -113,15 +113,18 @@ def links_told(log: Log, requirement: Requirement, ways: OpenWays, representativ
     left = len({way.ends for way in ways.doubtful}) + sum(way.excluded for way in open_)
     return LinksTold(
         len(asked), critical, left, int((~asked.ok).sum()) or None, len(open_) or None, ways.dividing or None,
-        len(joining) or None, _parts(list(joining.values()), representatives) or None,
+        len(joining) or None, _parts(joining.values(), representatives, log.history.where(log.history.stage != CONFIRM)) or None,
     )  # fmt: skip
 
 
-def _parts(joined: Sequence[tuple[tuple[int, ...], ...]], representatives: Collection[int]) -> tuple[JoinedPart, ...]:
-    """Return the sides of ways within modes, of several inputs each, that no representative stands for."""
-    found = dict[int, int]()
-    for sides in joined:
-        side = min(sides, key=lambda runs: (not set(runs).isdisjoint(representatives), len(runs)))
-        if len(side) >= _SEVERAL:
-            found[side[0]] = max(len(side), found.get(side[0], 0))
-    return tuple(JoinedPart(run, inputs) for run, inputs in sorted(found.items(), key=lambda part: -part[1]))
+def _parts(
+    joined: Iterable[tuple[tuple[int, ...], ...]], representatives: Collection[int], searched: History
+) -> tuple[JoinedPart, ...]:  # fmt: skip
+    """Return what ways in doubt join, of several inputs of the search each, that no representative stands for."""
+    found, row = list[JoinedPart](), {run: k for k, run in enumerate(searched.index.tolist())}
+    for part in dict.fromkeys(part for sides in joined for part in sides):
+        runs = [run for run in part if run in row]
+        inputs = len(np.unique(searched.x[[row[run] for run in runs]], axis=0)) if runs else 0
+        if inputs >= _SEVERAL and set(part).isdisjoint(representatives):
+            found.append(JoinedPart(runs[0], inputs))
+    return tuple(sorted(found, key=lambda part: -part.inputs))

@@ -42,7 +42,7 @@ T = TypeVar("T")
 Key = tuple[str | int, ...]
 """Path of keys and list positions."""
 _SURROGATE = re.compile("[\ud800-\udfff]")
-_TEXT = ("tag:yaml.org,2002:str", "tag:yaml.org,2002:merge")
+_TEXT = tuple(f"tag:yaml.org,2002:{name}" for name in ("str", "merge", "value"))
 _DEPTH = 30
 """Deeper nesting is an alias that contains itself."""
 

@@ -28,10 +28,11 @@ class Junctions:
 
     @cached_property
     def lack_lanes(self) -> bool:
-        """Whether the network that SUMO has loaded has no lanes inside junctions, or SUMO leaves them out."""
-        if self._sumo.simulation.getOption("no-internal-links") == "true":
-            return True
-        return not any(edge.startswith(":") for edge in self._sumo.edge.getIDList())
+        """Whether the network that SUMO has loaded has no lanes inside junctions of some width, or SUMO leaves them out."""
+        left_out = self._sumo.simulation.getOption("no-internal-links") == "true"
+        if not left_out and any(edge.startswith(":") for edge in self._sumo.edge.getIDList()):
+            return False
+        return any(_ends_before_next(self._sumo.lane, lane) for lane in self._sumo.lane.getIDList())
 
     def jumped(
         self, name: str, last: Sequence[float], at: tuple[float, float], heading: float, half: float, driven: float
@@ -61,7 +62,7 @@ class Junctions:
 
 def told_of_junctions(sumo: Any) -> str:
     """Return in words that SUMO's network has junctions of some width, and no lanes inside them; "" elsewhere."""
-    if not Junctions(sumo).lack_lanes or not any(_ends_before_next(sumo.lane, lane) for lane in sumo.lane.getIDList()):
+    if not Junctions(sumo).lack_lanes:
         return ""
     return (
         "the network has no lanes inside junctions, so that SUMO moves road users over one within a step: an ego there"

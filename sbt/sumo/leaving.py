@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from typing import Any
+
+from sbt.sumo.demand import seconds_of
 
 __all__ = ["Leaving", "why_gone"]
 
@@ -22,7 +26,7 @@ class Leaving:
     def __init__(self, sumo: Any, ego: str, arrival: tuple[str, str | None] | None):
         self._sumo, self._ego = sumo, ego
         self._somewhere, self._at_end = arrival is not None and arrival[1] is not None, arrival == ("max", None)
-        self._removes = sumo.simulation.getOption("time-to-teleport.remove") == "true"
+        self._patience = _patience(sumo.simulation.getOption)
         self._route, self._edges = "", tuple[str, ...]()
         self._index, self._position, self._waited, self._inside = 0, 0.0, 0.0, False
 
@@ -32,10 +36,13 @@ class Leaving:
         route = of.getRouteID(self._ego)
         if route != self._route:
             self._route, self._edges = route, tuple(of.getRoute(self._ego))
-        if self._removes:
+        if math.isfinite(self._patience):
             self._waited = of.getWaitingTime(self._ego)
         self._index, self._position = of.getRouteIndex(self._ego), of.getLanePosition(self._ego)
-        self._inside = of.getRoadID(self._ego).startswith(":")  # a junction, behind the edge
+        road = of.getRoadID(self._ego)
+        self._inside = road.startswith(":")  # a junction, behind the edge
+        if not self._inside and road != self._edges[self._index]:  # it overtakes on the opposite lane
+            self._position = self._sumo.lane.getLength(of.getLaneID(self._ego)) - self._position
 
     def why_removed(self, speed: float, dt: float) -> str:
         """Return why one that SUMO lists as arrived has not, as the end of a message; "" where it has.
@@ -50,13 +57,21 @@ class Leaving:
         left -= 0.0 if self._inside else self._position
         left += length(f"{goal}_0") if self._at_end else 0.0
         place = f"in the junction behind '{here}'" if self._inside else f"{self._position:.0f} m along '{here}'"
-        if self._waited > 0.0:
+        if self._waited >= self._patience - 1.5 * dt:
             return f"SUMO removed it from a jam, {place} (option time-to-teleport.remove)"
         if left <= reach or self._somewhere:
             return ""
         if self._index < len(self._edges) - 1:
             return f"it was removed {place}, before the end of its route on '{goal}'"
         return f"its route was cut to end {place} (a rerouter, or the loop)"
+
+
+def _patience(option: Callable[[str], str]) -> float:
+    """Return how long a vehicle waits before SUMO removes it from a jam (s); inf: it does not."""
+    if option("time-to-teleport.remove") != "true":
+        return math.inf
+    limits = [seconds_of(option(f"time-to-teleport{of}")) or 0.0 for of in ("", ".highways", ".disconnected")]
+    return min((limit for limit in limits if limit > 0.0), default=math.inf)
 
 
 def why_gone(sumo: Any, *, moved: bool) -> str:

@@ -234,15 +234,14 @@ def _placeholder(text: str, place: str, attribute: str = "") -> Placeholder:
 def _read(path: Path) -> bytes:
     """Return the bytes of a file in UTF-8, decompressed if it is gzipped."""
     try:
-        data = path.read_bytes()
-        if data[:2] != b"\x1f\x8b":
-            return _in_utf8(data, path)
-        most = max(_SMALL, _TIMES_SMALLER * len(data))
-        with gzip.open(io.BytesIO(data)) as file:
-            text = file.read(most + 1)
+        text = path.read_bytes()
+        most = max(_SMALL, _TIMES_SMALLER * len(text))
+        if packed := text[:2] == b"\x1f\x8b":
+            with gzip.open(io.BytesIO(text)) as file:
+                text = file.read(most + 1)
     except (OSError, EOFError, ValueError, zlib.error) as error:
         raise InputError(f"a SUMO file must be readable, but {path} is not: {error}") from None
-    if len(text) > most:
+    if packed and len(text) > most:
         raise InputError(f"a packed SUMO file may unpack to {_TIMES_SMALLER} times its size, but {path} unpacks to more")
     return _in_utf8(text, path)
 
