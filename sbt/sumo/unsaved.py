@@ -44,8 +44,9 @@ _CROSSING = "a saved state does not hold that level crossings are closed (rail_c
 _HOW_IT_WALKS = re.compile(rb"<(walk|personTrip)\b[^>]*\b(speed|duration)=")
 _PARAMETER = re.compile(rb"<param\b[^>]*>")
 _KEY = re.compile(rb"\bkey\s*=\s*[\"'](?:has\.(\w+)\.device|device\.(\w+)\.probability)[\"']")
-_NONE = re.compile(rb"\bvalue\s*=\s*[\"']\s*(?:false|no|off|f|x|-?[0.]+|-[\d.]+)?\s*[\"']", re.IGNORECASE)
-"""The value of one that equips nobody."""
+_VALUE = re.compile(rb"\bvalue\s*=\s*[\"']([^\"']*)")
+_NOBODY = re.compile(rb"\s*(?:false|no|off|f|x|-?[0.]+|-[\d.]+)?\s*", re.IGNORECASE)
+"""A value that equips nobody."""
 _RUNS_RED = re.compile(rb"\bjmDriveAfterRedTime\s*=\s*[\"'](?!-)")
 _STARTS_LATE = re.compile(rb"\bstartupDelay\s*=\s*[\"'](?!0*\.?0*[\"'])")
 _ON_RAILS = re.compile(rb"\bvClass\s*=\s*[\"'](?:rail|tram|subway)|[\"']DEFAULT_RAILTYPE[\"']")
@@ -56,7 +57,7 @@ def lost_by_option(name: str, value: str) -> str:
     if name in _FORBIDDEN and value != _FORBIDDEN[name]:
         return f"runs with the option {name} {value} load their traffic"
     device, _, what = name.removeprefix("device.").partition(".") if name.startswith("device.") else ("", "", "")
-    equips = (what == "probability" and not _NONE.search(f'value="{value}"'.encode())) or (what == "explicit" and value != "")
+    equips = (what == "probability" and not _NOBODY.fullmatch(value.encode())) or (what == "explicit" and value != "")
     if device in _DEVICES and equips:
         return f"{_DEVICES[device]}, as the option {name} has it"
     if name == "lanechange.duration" and seconds_of(value) != 0.0:
@@ -111,8 +112,9 @@ def lost_in_traffic(before: Iterable[Piece], definitions: Iterable[Piece], net: 
 def _lost_of(piece: Piece, text: bytes) -> str:
     """Return what a state lacks of one element: over which edges it drives, with what, and what its driver remembers."""
     for parameter in _PARAMETER.findall(text):
-        key = _KEY.search(parameter)
-        if key and (device := (key[1] or key[2]).decode()) in _DEVICES and not _NONE.search(parameter):
+        key, value = _KEY.search(parameter), _VALUE.search(parameter)
+        device = (key[1] or key[2]).decode() if key else ""
+        if device in _DEVICES and not (value and _NOBODY.fullmatch(value[1])):
             return _DEVICES[device]
     if _RUNS_RED.search(text):
         return _RED
