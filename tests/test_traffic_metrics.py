@@ -157,6 +157,29 @@ def test_time_behind_counts_only_who_comes_after_ego() -> None:
     assert time_behind(first, "ego", "co_0", 4.0, zone=(40.0, 0.0, 8.0)) == 4.0
 
 
+def crossing(dt: float, course: float, speeds: tuple[float, float], delay: float) -> Trace:
+    """Two cars of 4 m x 2 m whose middle lines cross, the second one later by a delay (s)."""
+    t = np.arange(0.0, 16.1, dt)
+    ways = speeds[0] * (t - 8.0), speeds[1] * (t - 8.0 - delay)
+    return driven((ways[0], 0.0 * t), (ways[1] * np.cos(course), ways[1] * np.sin(course)), dt=dt)
+
+
+def test_the_pet_of_two_that_cross_does_not_hang_on_the_step_in_which_they_are_recorded() -> None:
+    """Not even where both are over the crossing within a part of a step: no whole number of them has to touch."""
+    rng = np.random.default_rng(5)
+    between = 0
+    for _ in range(40):
+        ways = rng.uniform(0.5, 2.6), tuple(rng.uniform(5.0, 45.0, 2)), rng.uniform(-2.0, 2.0)
+        exact = post_encroachment_time(crossing(0.05, *ways), other="co_0")
+        for dt in (0.4, 1.0):
+            trace = crossing(dt, *ways)
+            accurate = pytest.approx(exact, abs=(dt + 0.05) / 1024)
+            assert post_encroachment_time(trace, other="co_0") == accurate
+            assert time_behind(trace, other=None) == (accurate if ways[2] > 0.0 else 10.0 if exact > 0.0 else 0.0)
+            between += dt == 1.0 and exact > 0.0
+    assert between > 20, "nothing was there to be missed"
+
+
 def test_ttc_on_paths_is_gap_by_closing_speed_and_knows_bends() -> None:
     t = np.arange(0.0, 3.0, 0.1)
     follow = driven((12.0 * t, 0.0 * t), (24.0 + 6.0 * t, 0.0 * t))

@@ -35,11 +35,15 @@ _BLOCK = 8
 """Instants that are first looked at together."""
 _DIVISIONS = (16, 8, 8)
 """The PET is accurate to the step of the trace divided by the product of these."""
+_FINEST = 64
+"""Parts of a step, at most, in which shifts are looked for; a power of two, and a divisor of that product."""
 _STRIDE = 5
 """Shifts of which the middle one tells whether any of them may matter; an odd number."""
 _SLACK = 1e-6
 """By how much farther apart than necessary those must be who are passed over (m)."""
 _Pair = tuple[ActorTrace, ActorTrace]
+_Poses = tuple[Vector, Vector, Vector]
+"""(n,) x, y (m) and heading (rad)."""
 
 
 def _zero_at_contact(trace: Trace, ego: str, other: str, values: Vector) -> Vector:
@@ -98,8 +102,9 @@ def post_encroachment_time(trace: Trace, ego: str = "ego", other: str = "co") ->
     """Return the smallest time between one road user leaving a spot and the other reaching it (s), at most 10.
 
     Computed as the smallest time shift of one of the two with which the rectangles would touch: the smallest number
-    of whole steps with which they do while they move, and then refined to step / 1,024.
-    0 for a collision. Only the recorded trace counts.
+    of steps with which they do while they move, and then refined to step / 1,024. Where one of them drives farther than
+    its length in a step, parts of steps in which neither does so are tried, too: two that cross touch with shifts
+    over more than that. 0 for a collision. Only the recorded trace counts.
 
     For straight paths that cross at right angles this is the time from the first road user leaving the conflict
     area to the second one entering it. (At an acute angle the conflict area is left later and entered earlier than
@@ -166,11 +171,29 @@ def _near_paths(trace: Trace, ego: str, horizon: int) -> list[str]:
 
 def _least_shift(own: ActorTrace, others: Sequence[ActorTrace], limit: int) -> float:
     """Return the least number of steps, at most `limit`, by which one of the others must come earlier to touch; inf: never."""
-    soonest = _smallest_shift([pair for other in others for pair in part_pairs(own, other)], limit)
-    if soonest is None:
+    if limit < 1:
         return math.inf
-    k, touching = soonest
-    return min(_refined(k, _behind(*pair, k)) for pair in touching)
+    most = _longest(own) / own.length
+    pairs, parts = list[_Pair](), list[int]()
+    for other in others:
+        found = list(part_pairs(own, other))
+        pairs += found
+        parts += [_parts_of_step(max(most, _longest(other) / other.length))] * len(found)
+    least = _first_shifts(pairs, [1] * len(pairs), limit)
+    divided = [k for k, n in enumerate(parts) if n > 1]
+    if divided:
+        soonest = int(min(limit, least.min()))
+        between = _first_shifts([pairs[k] for k in divided], [parts[k] for k in divided], soonest)
+        least[divided] = np.minimum(least[divided], between)
+    apart = least - 1.0 / np.array(parts, dtype=np.float64)  # shifts with which they do not touch yet
+    (near,) = (apart < np.min(least, initial=math.inf)).nonzero()
+    refined = (_refined(least[k], parts[k], _behind(*pairs[k], math.ceil(least[k]))) for k in near.tolist())
+    return min(refined, default=math.inf)
+
+
+def _parts_of_step(lengths: float) -> int:
+    """Return into how many parts a step is divided so that nobody who drives so many of its lengths drives more than one."""
+    return min(1 << (math.ceil(lengths) - 1).bit_length(), _FINEST) if lengths > 1.0 else 1
 
 
 def _behind(a: ActorTrace, b: ActorTrace, k: int) -> Callable[[Vector], np.ndarray]:
@@ -197,58 +220,73 @@ def _behind(a: ActorTrace, b: ActorTrace, k: int) -> Callable[[Vector], np.ndarr
     return touches
 
 
-def _smallest_shift(pairs: Sequence[_Pair], limit: int) -> tuple[int, list[_Pair]] | None:
-    """Return the smallest number of steps, 1 to `limit`, by which a second one must come earlier to touch the first.
+def _first_shifts(pairs: Sequence[_Pair], parts: Sequence[int], limit: int) -> Vector:
+    """Return (n,) the smallest number of steps, at most `limit`, by which the second of each pair must come earlier to touch.
 
     Circles around the rectangles, enlarged by the motion in a step, select the pairs of instants to be tested.
 
     Args:
         pairs: rectangles, the second ones with as many instants as each other, or more.
+        parts: (n,) into how many a step is divided; 1: whole steps are tried, else what lies between them.
         limit: of the steps.
 
     Returns:
-        The number, and the pairs that touch then; None if none does.
+        The numbers; inf where they do not touch.
     """
-    found = [_near_shifts(a, b, limit) for a, b in pairs] if limit >= 1 else []
-    if not any(len(shift) for _, shift, _, _ in found):
-        return None
-    which = np.repeat(np.arange(len(pairs)), [len(shift) for _, shift, _, _ in found])
-    shifts = np.concatenate([shift for _, shift, _, _ in found])
-    ends = [_joined([(pair[c], f[0] + c * (f[1] + 1)) for pair, f in zip(pairs, found, strict=True)]) for c in (0, 1)]
-    dx, dy = (np.concatenate([f[c] for f in found]) for c in (2, 3))
-    hits = np.isfinite(contact_share(ends[0], ends[1], dx, dy))
-    if not hits.any():
-        return None
-    k = int(shifts[hits].min())
-    return k + 1, [pairs[i] for i in np.unique(which[hits & (shifts == k)]).tolist()]
+    least = np.full(len(pairs), np.inf)
+    near = [_near_shifts(a, b, limit, n) for (a, b), n in zip(pairs, parts, strict=True)]
+    counts = [len(shifts) for shifts, *_ in near]
+    if not any(counts):
+        return least
+    shifts, dx, dy = (np.concatenate([f[c] for f in near]) for c in (0, 1, 2))
+    first = _joined([(a, poses) for (a, _), (*_, poses, _) in zip(pairs, near, strict=True)])
+    second = _joined([(b, poses) for (_, b), (*_, poses) in zip(pairs, near, strict=True)])
+    hits = np.isfinite(contact_share(first, second, dx, dy))
+    np.minimum.at(least, np.repeat(np.arange(len(pairs)), counts)[hits], shifts[hits])
+    return least
 
 
-def _near_shifts(a: ActorTrace, b: ActorTrace, limit: int) -> tuple[np.ndarray, np.ndarray, Vector, Vector]:
-    """Return (n,) instants of a, shifts less 1 with which b may touch it there, and how far apart they were a step before."""
+def _near_shifts(a: ActorTrace, b: ActorTrace, limit: int, parts: int) -> tuple[Vector, Vector, Vector, _Poses, _Poses]:
+    """Return (n,) shifts with which b may touch a at some instants, how far apart they were a step before, and both then."""
     steps = [(u[1:] - u[:-1], v[1:] - v[:-1]) for u, v in ((a.x, b.x), (a.y, b.y))]
     ends = [[(np.fmin.reduce(s, initial=np.inf), np.fmax.reduce(s, initial=-np.inf)) for s in both] for both in steps]
     moved = np.hypot(*(max(v[1] - u[0], u[1] - v[0], 0.0) for u, v in ends))  # the most, relative to each other
     reach = 0.5 * (np.hypot(a.length, a.width) + np.hypot(b.length, b.width)) + moved
     stride = 1 if np.isnan(b.x).any() else _STRIDE
-    far = reach + (stride // 2) * _longest(b) + _SLACK
+    far = reach + (stride // 2 + (parts > 1)) * _longest(b) + _SLACK
     x, y = (_later(v, len(a.x), -(-limit // stride) * stride)[:, stride // 2 :: stride] for v in (b.x, b.y))  # middles
     x, y = x - a.x[:, None], y - a.y[:, None]
     rows, which = (x * x + y * y <= far * far).nonzero()
     i, shift = np.repeat(rows, stride), (stride * which[:, None] + np.arange(stride)).ravel()
     known = (shift < limit) & (i + shift + 1 < len(b.x))
-    i, shift = i[known], shift[known]
+    i, shift, share = i[known], shift[known], None
+    if parts > 1:
+        share = np.tile(np.arange(1.0, parts) / parts, len(i))
+        i, shift = np.repeat(i, parts - 1), np.repeat(shift, parts - 1)
     later, before = i + shift + 1, np.maximum(i - 1, 0)  # no step leads to the first instant
-    dx, dy = b.x[later] - a.x[i], b.y[later] - a.y[i]
+    x, y = _at(b.x, later, share), _at(b.y, later, share)
+    dx, dy = x - a.x[i], y - a.y[i]
     near = dx * dx + dy * dy <= reach * reach
-    i, shift, before = i[near], shift[near], before[near]
+    i, shift, before, later, x, y = i[near], shift[near], before[near], later[near], x[near], y[near]
+    share = None if share is None else share[near]
+    heading = _at(b.heading, later, share, turns=True)
     later = before + shift + 1
-    return i, shift, b.x[later] - a.x[before], b.y[later] - a.y[before]
+    apart = _at(b.x, later, share) - a.x[before], _at(b.y, later, share) - a.y[before]
+    return shift + (1.0 if share is None else share), *apart, (a.x[i], a.y[i], a.heading[i]), (x, y, heading)
 
 
-def _joined(some: Sequence[tuple[ActorTrace, np.ndarray]]) -> Rectangles:
-    """Return rectangles at some of their instants, one after another."""
-    x, y, heading = (np.concatenate([getattr(actor, name)[i] for actor, i in some]) for name in ("x", "y", "heading"))
-    counts = [len(i) for _, i in some]
+def _at(values: Vector, k: np.ndarray, share: Vector | None, *, turns: bool = False) -> Vector:
+    """Return values after a share of the step before each of some instants, None: all of it; turns: angles (rad)."""
+    if share is None:
+        return np.asarray(values[k])
+    change = values[k] - values[k - 1]
+    return np.asarray(values[k - 1] + share * (np.arctan2(np.sin(change), np.cos(change)) if turns else change))
+
+
+def _joined(some: Sequence[tuple[ActorTrace, _Poses]]) -> Rectangles:
+    """Return rectangles of some actors, one after another."""
+    x, y, heading = (np.concatenate([poses[c] for _, poses in some]) for c in (0, 1, 2))
+    counts = [len(poses[0]) for _, poses in some]
     return Rectangles(x, y, heading, *(np.repeat([getattr(actor, s) for actor, _ in some], counts) for s in ("length", "width")))
 
 
@@ -266,12 +304,14 @@ def _later(values: Vector, n: int, limit: int) -> np.ndarray:
     return sliding_window_view(padded, limit)[:n]
 
 
-def _refined(k: int, meet: Callable[[Vector], np.ndarray]) -> float:
-    """Return the smallest shift in (k - 1, k] steps with which the rectangles touch; they do with k."""
-    least, width = float(k), 1.0
-    for divisions in _DIVISIONS:
+def _refined(least: float, parts: int, meet: Callable[[Vector], np.ndarray]) -> float:
+    """Return the smallest shift in one of so many parts of a step with which the rectangles touch; they do at its end."""
+    width = 1.0 / parts
+    for each in _DIVISIONS:
+        done = min(each, parts)
+        parts, divisions = parts // done, each // done
         begin, width = least - width, width / divisions
-        met = np.flatnonzero(meet(begin + width * np.arange(1.0, divisions)))
+        met = np.flatnonzero(meet(begin + width * np.arange(1.0, divisions))) if divisions > 1 else np.empty(0)
         least = begin + width * (int(met[0]) + 1 if met.size else divisions)
     return least
 
