@@ -20,8 +20,8 @@ ROAD = net({"road": [(0.0, 0.0), (600.0, 0.0)]}, lanes=2)
 RADII = (2.0, 10.0, 30.0, 100.0)
 
 
-def around(folder: Path, vehicles: str, loop: Loop, within: float, duration: float = 12.0) -> Trace:
-    made = simulation(folder, ROAD, vehicles, loop, duration, step_length="0.1")
+def around(folder: Path, vehicles: str, loop: Loop, within: float, duration: float = 12.0, step: str = "0.1") -> Trace:
+    made = simulation(folder, ROAD, vehicles, loop, duration, step_length=step)
     return replace(made, recording=replace(made.recording, within=within))({}, 1)
 
 
@@ -49,6 +49,15 @@ def test_who_runs_into_a_long_ego_is_met(tmp_path: Path):
     vehicles = bodies(5.0, own=18.0) + vehicle("ego", "road", "own", departPos=120, departSpeed=5)
     vehicles += vehicle("o", "road", "other", departPos=20, departSpeed=25)
     found = [around(tmp_path, vehicles, deaf("ego", "o"), within) for within in RADII]
+    assert {(trace.ended, float(trace.time[-1])) for trace in found} == {("collision", float(found[-1].time[-1]))}
+
+
+@pytest.mark.parametrize(("length", "start"), [(5.0, 20.0), (5.0, 27.0), (5.0, 34.0), (5.0, 41.0), (25.0, 30.0)])
+def test_who_drives_farther_than_the_radius_in_a_step_is_met(tmp_path: Path, length: float, start: float):
+    """Outside the radius before the step, or after it, one had no step in which it could touch."""
+    vehicles = bodies(length) + vehicle("ego", "road", "own", departPos=200, departSpeed=5)
+    vehicles += vehicle("o", "road", "other", departPos=start, departSpeed=40)
+    found = [around(tmp_path, vehicles, deaf("ego", "o"), within, step="1") for within in RADII]
     assert {(trace.ended, float(trace.time[-1])) for trace in found} == {("collision", float(found[-1].time[-1]))}
 
 

@@ -53,7 +53,7 @@ class Surroundings:
     Args:
         sumo: libsumo or traci, started.
         ego: id of the vehicle under test.
-        within: radius around its body in which the bodies of others are (m).
+        within: radius around its body in which the bodies of others are (m), where two do not drive more in a step.
         named: vehicles that are recorded at any distance.
         dt: step (s).
 
@@ -67,7 +67,7 @@ class Surroundings:
 
     def __init__(self, sumo: Any, ego: str, within: float, named: Iterable[str], dt: float):
         self._sumo, self._ego, self._dt = sumo, ego, dt
-        self._nearby = Nearby(sumo, ego, within)
+        self._nearby = Nearby(sumo, ego, within, dt)
         self._named = frozenset(named)
         self._named_present: set[str] = set()
         self._centre_offsets: dict[str, float] = {}
