@@ -8,11 +8,14 @@ import re
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from own_networks import run_program
+from test_evidence import deaf, net, simulation, vehicle
 
 from sbt.execution.spec import ScenarioSpec
 from sbt.execution.worker import run_job
+from sbt.metrics.traffic import any_collision
 from sbt.problem.outcome import Job, Outcome
 from sbt.sumo.leaving import Leaving
 
@@ -121,3 +124,37 @@ def test_who_stood_or_overtook_at_its_end_has_arrived(road: str, lane: str, posi
     found = leaving.why_removed(0.0, 0.1)
     assert said in found
     assert bool(found) == bool(said)
+
+
+def arriving(folder: Path, step: str, kind: str, *, rear: float = 395.0, speed: float = 0.0, **of_ego: float):
+    """Return the trace of an ego that looks at nobody and arrives at 400 m, where another one is, of so long a body."""
+    kinds = f'<vType id="other" length="{kind}" width="1.8"/><vType id="own" length="4.5" width="1.8"/>'
+    given = {"departPos": 333.0, "departSpeed": 20.0, "arrivalPos": 400.0} | of_ego
+    other = vehicle("o", "road", "other", departPos=rear + float(kind), departSpeed=speed)
+    road = net({"road": [(0.0, 0.0), (600.0, 0.0)]})
+    return simulation(folder, road, kinds + vehicle("ego", "road", "own", **given) + other, deaf("ego", "o"), 20.0, step_length=step)({}, 1)
+
+
+@pytest.mark.sumo
+@pytest.mark.parametrize("kind", ["4.5", "16.5"])
+@pytest.mark.parametrize("step", ["0.1", "0.5", "1"])
+def test_an_ego_arrives_only_where_nobody_is(tmp_path: Path, kind: str, step: str):
+    """In the step in which SUMO took it off the road it drove through whoever stood there."""
+    for rear in (388.0, 391.0, 394.0, 399.0):
+        trace = arriving(tmp_path, step, kind, rear=rear)
+        assert (trace.ended, any_collision()(trace)) == ("collision", 1.0), rear
+        assert trace.time[-1] == pytest.approx(np.ceil((rear - 333.0) / 20.0 / float(step)) * float(step), abs=1.01 * float(step))
+        at_its_end = trace.x[-1, 0] + 2.25 > 400.0
+        assert any("the ego arrives within this step" in text for text in trace.unconfirmed) == at_its_end
+
+
+@pytest.mark.sumo
+@pytest.mark.parametrize("step", ["0.1", "1"])
+def test_an_ego_touches_nobody_after_it_has_arrived(tmp_path: Path, step: str):
+    """Nor whom it would not have met if it had braked within that step."""
+    alone = arriving(tmp_path, step, "4.5", rear=500.0)
+    braking = [(349.5, 15.0)] if step == "1" else []  # its rear is at 399.75 m when the ego, 1.5 m behind before, is there at 20 m/s
+    for rear, speed in ((400.5, 0.0), (410.0, 0.0), (395.0, 18.0), (390.0, 20.0), *braking):
+        trace = arriving(tmp_path, step, "4.5", rear=rear, speed=speed)
+        assert (trace.ended, any_collision()(trace)) == ("left", 0.0)
+        assert np.array_equal(trace.x[:, 0], alone.x[:, 0])

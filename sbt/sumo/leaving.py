@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from sbt.sumo.demand import seconds_of
+from sbt.sumo.departures import number_or_none
 
 __all__ = ["Leaving", "why_gone"]
 
@@ -25,6 +26,7 @@ class Leaving:
 
     def __init__(self, sumo: Any, ego: str, arrival: tuple[str, str | None] | None):
         self._sumo, self._ego = sumo, ego
+        self._arrival = arrival
         self._somewhere, self._at_end = arrival is not None and arrival[1] is not None, arrival == ("max", None)
         self._patience = _patience(sumo.simulation.getOption)
         self._route, self._edges = "", tuple[str, ...]()
@@ -43,6 +45,14 @@ class Leaving:
         self._inside = road.startswith(":")  # a junction, behind the edge
         if not self._inside and road != self._edges[self._index]:  # it overtakes on the opposite lane
             self._position = self._sumo.lane.getLength(of.getLaneID(self._ego)) - self._position
+
+    def on_last_edge(self) -> tuple[str, float, float] | None:
+        """Return the last edge of its route, where it was on it, and where it arrives (m); None where one is not known."""
+        if self._arrival is None or self._somewhere or self._inside or self._index < len(self._edges) - 1:
+            return None
+        goal, length = self._edges[-1], self._sumo.lane.getLength(f"{self._edges[-1]}_0")
+        end = length if self._at_end else number_or_none(self._arrival[0])
+        return None if end is None else (goal, self._position, min(end + length if end < 0.0 else end, length))
 
     def why_removed(self, speed: float, dt: float) -> str:
         """Return why one that SUMO lists as arrived has not, as the end of a message; "" where it has.

@@ -18,12 +18,14 @@ import numpy as np
 
 from sbt.errors import InputError, RunError
 from sbt.metrics.conflict_types import from_behind
+from sbt.metrics.geometry import rectangle_distance
 from sbt.problem.outcome import STRUCK, Status
 from sbt.problem.parameter import Parameter
 from sbt.problem.plain import Values
 from sbt.problem.trace import ActorTrace, Trace
 from sbt.sumo.actors import view_of
 from sbt.sumo.appearances import AppearanceMonitor
+from sbt.sumo.arriving import last_step, unknown_end, way_to
 from sbt.sumo.contacts import CONFIRMED_WITHIN, collisions_of, listed_only, unconfirmed_contact
 from sbt.sumo.departures import DepartureMonitor, RequestedDeparture
 from sbt.sumo.ego import Ego
@@ -31,6 +33,7 @@ from sbt.sumo.ego_vehicle import EgoControl, EgoVehicle
 from sbt.sumo.guided import Placed
 from sbt.sumo.leaving import Leaving
 from sbt.sumo.surroundings import Surroundings
+from sbt.sumo.trailing import LONGEST_RIGID
 
 __all__ = ["Recorder", "RecordingSettings", "RunEnded"]
 
@@ -250,11 +253,28 @@ class Recorder:
             removed = self._leaving.why_removed(near.states[self._ego].speed, self._dt)
             if removed:
                 raise RunError(Status.INVALID, f"the ego '{self._ego}' must stay on its way, but at {self._now()} {removed}")
+            self._end_at_contact()
         if self._settings.ego.may_leave:
             self._end("left")
         rule = f"the ego '{self._ego}' must stay for the duration of {self._settings.duration:g} s"
         remedy = "make the route longer or the duration shorter, or set may_leave: true"
         raise RunError(Status.FAILED, f"{rule}, but it left after {self._t + self._dt:g} s, at the end of its route: {remedy}")
+
+    def _end_at_contact(self) -> None:
+        """End the run at a contact that the ego has before it arrives, as far as its way until then is known."""
+        near, there = self._surroundings, self._leaving.on_last_edge()
+        own = near.states[self._ego]
+        way = None if there is None or own.length > LONGEST_RIGID else way_to(self._sumo, *there, own)
+        found = None if way is None else last_step(self._sumo, near, self._ego, way, self._dt)
+        if found is None:
+            return
+        near.record_arrival(found)
+        listed = collisions_of(self._sumo, self._ego)
+        self._collisions += [f"{self._ego}>{name}@{self._t:.3f}" for name in sorted(listed)]
+        if found.other not in listed and self._t - self._listed.get(found.other, -math.inf) > CONFIRMED_WITHIN:
+            self._differing[found.other] = unknown_end(found.other, self._t)
+        self._note_struck([one for one in near.touching() if one[0] == found.other])
+        self._end("collision")
 
     def _record_step(self, departed: frozenset[str]) -> None:
         """Record the states, SUMO's list of collisions, and contacts; end the run at a contact of the ego."""
@@ -280,7 +300,9 @@ class Recorder:
         for other in {b if a == self._ego else a for a, b in listed if self._ego in (a, b)} - touched:
             if self._t - self._listed.get(other, -math.inf) > CONFIRMED_WITHIN:
                 persons = [name for name in (self._ego, other) if self._surroundings.is_person(name)]
-                apart = self._surroundings.distance(other)
+                near = self._surroundings
+                there = other in near.present
+                apart = float(rectangle_distance(near.body(self._ego), near.body(other))[0]) if there else None
                 self._differing[other] = listed_only(self._sumo, self._ego, other, self._t, apart, persons=persons)
             self._listed[other] = self._t
 
@@ -305,9 +327,13 @@ class Recorder:
         for name in listed:
             self._differing.pop(name, None)
         self._differing |= {name: text for name, text in texts.items() if name not in listed}
+        self._note_struck(touched)
+
+    def _note_struck(self, touched: list[tuple[str, ActorTrace, ActorTrace]]) -> None:
+        """Tell apart who drives as it was recorded, into the ego from behind."""
         self._struck = [
             f"{STRUCK}'{name}' at {self._t:.3f} s: it drives as it was recorded, whatever the ego does"
-            for name, own, other in touched if name in near.placed and from_behind(own, other)
+            for name, own, other in touched if name in self._surroundings.placed and from_behind(own, other)
         ]  # fmt: skip
 
     def trace(self, ended: str) -> Trace:

@@ -16,10 +16,11 @@ from typing import Any
 import numpy as np
 
 from sbt.errors import RunError
-from sbt.metrics.geometry import LANE_CHANGE, contact_part, farthest, rectangle_distance
+from sbt.metrics.geometry import LANE_CHANGE, contact_part, farthest
 from sbt.problem.outcome import Status
 from sbt.problem.trace import ActorTrace, States, Trace
 from sbt.sumo.actors import State
+from sbt.sumo.arriving import LastStep
 from sbt.sumo.ego_level import EgoLevel
 from sbt.sumo.guided import Placed
 from sbt.sumo.identity import check_sizes, refuse_twice
@@ -30,6 +31,7 @@ from sbt.sumo.nearby import Nearby
 from sbt.sumo.off_lanes import ANGLE, POSITION, SPEED, VEHICLE, off_lanes, parking, placed_variables, read
 from sbt.sumo.overlaps import Rectangle, separate
 from sbt.sumo.session import INVALID_DOUBLE, is_ballistic
+from sbt.sumo.tables import table_of
 from sbt.sumo.teleports import Teleports
 from sbt.sumo.trailing import LONGEST_RIGID, TrailingBody, part_traces
 from sbt.sumo.ways import LEFT_THE_ROAD, line_ahead, line_behind, rectangle_ways
@@ -306,6 +308,17 @@ class Surroundings:
                 found.append((name, *touched[1:]))
         return found
 
+    def record_arrival(self, step: LastStep) -> None:
+        """Append the step in which the ego arrives."""
+        row, parts = {self._ego: step.own}, dict[str, int]()
+        for name, variables in step.others.items():
+            self._record(row, parts, self._rows[-1], name, variables)
+        for name in (one for one in self.present if one not in row):
+            self._keep_way(name)
+        self.present = list(row)
+        self._rows.append(row)
+        self._parts.append(parts)
+
     def newcomers(self) -> list[str]:
         """Return who is recorded now and was not at the instant before, sorted; in the first instant, everybody else."""
         before = self._rows[-2].keys() if len(self._rows) > 1 else frozenset((self._ego,))
@@ -314,12 +327,6 @@ class Surroundings:
     def body(self, name: str) -> ActorTrace:
         """Return the body of a road user that is present now, as a trace of one instant."""
         return self._track(name, [len(self._rows) - 1], [self._rows[-1][name]])
-
-    def distance(self, name: str) -> float | None:
-        """Return the distance between the bodies of the ego and another road user now (m); None where it is not there."""
-        if name not in self.present:
-            return None
-        return float(rectangle_distance(self.body(self._ego), self.body(name))[0])
 
     def _near(self, name: str) -> bool:
         """Return whether no axis of a rectangle separates any of the ego's from the other's during the last step."""
@@ -370,11 +377,7 @@ class Surroundings:
             if name in there:
                 self._keep_way(name)
         names = tuple(self.states)
-        column = {name: k for k, name in enumerate(names)}
-        table = np.full((len(self._rows), len(names), 5), np.nan)
-        at = [(i, column[name]) for i, row in enumerate(self._rows) for name in row]
-        i, j = np.array(at).T
-        table[i, j] = np.array([state for row in self._rows for state in row.values()])
+        column, table = {name: k for k, name in enumerate(names)}, table_of(self._rows, names)
         x, y, heading, speed, acceleration = np.moveaxis(table, 2, 0)
         return Trace(
             np.arange(len(table), dtype=np.float64) * self._dt, names, x, y, heading, speed, acceleration,
@@ -391,10 +394,7 @@ class Surroundings:
 
     def _parts_of(self, name: str, table: np.ndarray) -> tuple[ActorTrace, ...]:
         """Return the parts of a long vehicle over all instants, NaN where it is not there."""
-        body, state = self._bodies[name], self.states[name]
-        poses = np.full((len(self._rows), body.count, 3), np.nan)
-        rows = [k for k, parts in enumerate(self._parts) if name in parts]
-        poses[rows] = body.poses([self._parts[k][name] for k in rows])
-        made = part_traces(poses, table[:, 3], table[:, 4], body.part_length, state.width)
+        poses = self._bodies[name].poses_among([parts.get(name) for parts in self._parts])
+        made = part_traces(poses, table[:, 3], table[:, 4], self._bodies[name].part_length, self.states[name].width)
         ways = self._ways.get(name, ())[1:]
         return tuple(replace(part, way=way) for part, way in zip(made, ways, strict=True)) if ways else made

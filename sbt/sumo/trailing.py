@@ -77,6 +77,13 @@ class TrailingBody:
         self._instants.append((len(self._paths) - 1, len(self._paths[-1].x), *front, cos, sin))
         return len(self._instants) - 1
 
+    def poses_among(self, at: Sequence[int | None]) -> np.ndarray:
+        """Return what `poses` does, NaN where there is no step (None): (n, parts, 3)."""
+        found = np.full((len(at), self.count, 3), np.nan)
+        rows = [k for k, step in enumerate(at) if step is not None]
+        found[rows] = self.poses([step for step in at if step is not None])
+        return found
+
     def _changes(self, lane: str, other: str, travelled: float, front: Point) -> bool:
         """Return whether who was on one lane and is on another has changed lanes: on one edge, or while it entered one.
 
