@@ -39,9 +39,9 @@ class ChancePlace:
     runs: int
     hits: int
 
-    def words(self, here: str, condition: str, units: Mapping[str, str]) -> str:
-        """Return the first words of a conclusion, of a scenario (`In x`), and what critical is."""
-        where, share = self.place.words(units, edges=False), percent(self.hits / self.runs)
+    def words(self, here: str, condition: str, units: Mapping[str, str], widths: Mapping[str, float] | None = None) -> str:
+        """Return the first words of a conclusion, of a scenario (`In x`), and what critical is; see `BoundaryPlace.words`."""
+        where, share = self.place.words(units, widths, edges=False), percent(self.hits / self.runs)
         said = f"{here}, chance decides which runs are critical ({condition}); most often they are where {where}"
         return f"{said} (by the metamodel): {self.hits:,} of the {plural(self.runs, 'run')} there ({share})"
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sbt.campaigns.place import LogOdds, succeeding
-from sbt.campaigns.wording import measured, plural
+from sbt.campaigns.wording import input_value, measured, plural
 from sbt.problem.plain import Value
 from sbt.problem.scenario import LogicalScenario
 
@@ -67,12 +67,12 @@ def critical_combinations(
 
 def _named(row: Mapping[str, Value], units: Mapping[str, str]) -> str:
     more = f", {plural(len(row) - _NAMED, 'more input')}" if len(row) > _NAMED else ""
-    return ", ".join(measured(name, row[name], units.get(name, "")) for name in list(row)[:_NAMED]) + more
+    return ", ".join(measured(name, input_value(row[name]), units.get(name, "")) for name in list(row)[:_NAMED]) + more
 
 
 def _range(name: str, values: tuple[Value, ...], units: Mapping[str, str]) -> str:
     if len(values) == 1:
-        return measured(name, values[0], units.get(name, ""))
+        return measured(name, input_value(values[0]), units.get(name, ""))
     if isinstance(values[0], str):
         return f"{name} {' or '.join(map(str, values))}"
-    return f"{measured(name, values[0])} to {measured('', values[-1], units.get(name, '')).strip()}"
+    return f"{name} {input_value(values[0])} to {measured('', input_value(values[-1]), units.get(name, '')).strip()}"

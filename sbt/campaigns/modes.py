@@ -11,6 +11,7 @@ from scipy.spatial.distance import cdist
 
 from sbt.campaigns.between import RunsBetween
 from sbt.campaigns.linking import Link, connected, pairs_joined
+from sbt.campaigns.wording import input_widths, narrow_digits
 from sbt.estimators.binomial import interval
 from sbt.metrics.conflict_types import METRIC_NAME as CONFLICT_TYPE
 from sbt.metrics.conflict_types import describe_conflict_type, without_standing
@@ -115,6 +116,7 @@ class FailureMode:
         preventable: what the reference drivers made of the representative; None: they were not asked.
         violates: of a combination, how many of its runs violate each requirement.
         choices: of inputs with choices, all that its critical runs have, where they have several.
+        digits: significant digits that tell inputs of a narrow range, by name; None: three are enough.
         unconfirmed: its critical runs with a contact that SUMO's own list does not confirm.
     """
 
@@ -134,6 +136,7 @@ class FailureMode:
     failure_rate: FailureRate | None = optional()
     confirmations_lost: int | None = optional()
     choices: Mapping[str, tuple[str, ...]] | None = optional()
+    digits: Mapping[str, int] | None = optional()
 
 
 def severity(history: History) -> Vector:
@@ -244,6 +247,7 @@ def describe(mode: Mode, history: History, scenario: LogicalScenario, again: His
         violates=violations(requirement, history.where(np.isin(np.arange(len(history)), mode.rows))),
         failure_rate=FailureRate.of(requirement.critical_runs(again), ~again.ok) if noisy and len(again) else None,
         confirmations_lost=int((~again.ok).sum()) or None, choices=_choices_of(mode, history) or None,
+        digits=narrow_digits(inputs, input_widths(history)) or None,
     )  # fmt: skip
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import expit
 
-from sbt.campaigns.wording import measured, number, plural
+from sbt.campaigns.wording import input_value, measured, plural
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.plain import Value
 from sbt.problem.scenario import LogicalScenario
@@ -31,6 +31,7 @@ _STEP = 0.002  # of the unit cube, to both sides, for the direction of the steep
 _GIVES = 0.8  # P(a run gives a metric) below which it is said that runs may fail there
 _CELLS = 400  # of a line on which edges are looked for
 _CUTS = (0.1, 0.5, 0.9)  # quantiles of the second input along the boundary
+_APART = 1e-3  # of how far lines reach: those that are nearer are one
 _MOST = 1e6  # log odds beyond which nothing is told apart
 _SURE = 0.95  # outside of this and its complement the metamodel is sure of a side
 
@@ -84,11 +85,29 @@ class BoundaryPlace:
         """Whether an edge is less certain than the critical stretch beside it is wide."""
         return any(cut.unsure >= min(s.high - s.low for s in cut.critical) for cut in self.cuts)
 
-    def words(self, units: Mapping[str, str], *, edges: bool = True) -> str:
-        """Return where critical meets uncritical, in words; with how sure `edges` are."""
+    def words(self, units: Mapping[str, str], widths: Mapping[str, float] | None = None, *, edges: bool = True) -> str:
+        """Return where critical meets uncritical, in words.
+
+        Args:
+            units: of the inputs, by name.
+            widths: of their ranges, from which digits follow; None: that of the first input alone is known.
+            edges: tell how sure they are.
+        """
+        widths = widths or {}
+        said = self._lines(units, widths, edges=edges)
+        if self.fixed:
+            names = sorted(self.fixed, key=lambda name: -self.weights.get(name, 0.0))
+            values = {name: input_value(self.fixed[name], widths.get(name, np.inf)) for name in names[:_MOST_FIXED]}
+            told = [measured(name, value, units.get(name, "")) for name, value in values.items()]
+            told += [f"{plural(len(names) - _MOST_FIXED, 'more input')} fixed too"] if len(names) > _MOST_FIXED else []
+            said += f", in the section with {', '.join(told)}"
+        return said
+
+    def _lines(self, units: Mapping[str, str], widths: Mapping[str, float], *, edges: bool) -> str:
+        """Return what the lines tell."""
         first, unit = self.inputs[0], units.get(self.inputs[0], "")
         second = self.inputs[1] if len(self.inputs) > 1 else ""
-        at = ["" if cut.at is None else measured("", cut.at, units.get(second, "")).strip() for cut in self.cuts]
+        at = self._at(widths.get(second, np.inf), units.get(second, ""))
         parts = []
         for k, cut in enumerate(self.cuts):
             if at[k] not in at[:k]:
@@ -97,25 +116,28 @@ class BoundaryPlace:
         unsure = measured("", max(cut.unsure for cut in self.cuts), unit, 2).strip()
         lost = ", as far as runs give a metric" if any(cut.lost for cut in self.cuts) else ""
         sure = f" (edges \N{PLUS-MINUS SIGN}{unsure} at worst, by the metamodel)" if edges else ""
-        said = f"{first} is {', '.join(parts)}{lost}{sure}"
-        if self.fixed:
-            names = sorted(self.fixed, key=lambda name: -self.weights.get(name, 0.0))
-            told = [measured(name, self.fixed[name], units.get(name, "")) for name in names[:_MOST_FIXED]]
-            told += [f"{plural(len(names) - _MOST_FIXED, 'more input')} fixed too"] if len(names) > _MOST_FIXED else []
-            said += f", in the section with {', '.join(told)}"
-        return said
+        return f"{first} is {', '.join(parts)}{lost}{sure}"
+
+    def _at(self, width: float, unit: str) -> list[str]:
+        """Return where each line lies, in words: different ones differ."""
+        values = np.unique([cut.at for cut in self.cuts if cut.at is not None])
+        gaps = np.diff(values)
+        gap = float(gaps[gaps > _APART * min(width, np.ptp(values))].min(initial=np.inf)) if len(gaps) else np.inf
+        said = [None if cut.at is None else input_value(cut.at, width, sure=0.5 * gap) for cut in self.cuts]
+        return ["" if each is None else measured("", each, unit).strip() for each in said]
 
     def _stretches(self, cut: Cut, unit: str) -> list[str]:
         """Return the widest critical stretches of the first input, without ends of its range, and how many others there are."""
         said, widest = [], sorted(cut.critical, key=lambda stretch: stretch.low - stretch.high)[:_MOST_STRETCHES]
+        width = self.high - self.low
         for stretch in sorted(widest, key=lambda stretch: stretch.low):
-            low, high = number(stretch.low, 3), measured("", stretch.high, unit).strip()
+            low, high = (input_value(end, width, sure=cut.unsure) for end in (stretch.low, stretch.high))
             if stretch.low <= self.low:
-                said.append(f"below {high}")
+                said.append(f"below {measured('', high, unit).strip()}")
             elif stretch.high >= self.high:
-                said.append(f"above {measured('', stretch.low, unit).strip()}")
+                said.append(f"above {measured('', low, unit).strip()}")
             else:
-                said.append(f"{low} to {high}")
+                said.append(f"{low} to {measured('', high, unit).strip()}")
         others = len(cut.critical) - len(widest)
         return [*said, f"in {plural(others, 'narrower part')}"] if others else said
 

@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 
 from sbt.campaigns.place import LogOdds, Stretch, succeeding
-from sbt.campaigns.wording import measured, number, percent, plural
+from sbt.campaigns.wording import input_value, measured, percent, plural
 from sbt.problem.arrays import Mask, Points
 from sbt.problem.scenario import LogicalScenario
 from sbt.samplers.sobol import SobolSequence
@@ -91,15 +91,20 @@ def critical_regions(
     return tuple(found)
 
 
-def regions_words(regions: tuple[CriticalRegion, ...], inputs: tuple[str, ...], units: Mapping[str, str]) -> str:
+def regions_words(
+    regions: tuple[CriticalRegion, ...], inputs: tuple[str, ...], units: Mapping[str, str], widths: Mapping[str, float]
+) -> str:
     """Return how many regions there are, and where the largest lie along these inputs; nothing where one is nearly all."""
     large = [region for region in regions if region.share >= _LARGE * sum(each.share for each in regions)]
     if len(large) < 2:
         return ""
     told = []
     for region in large[:_TOLD]:
-        ends = [(name, region.extent[name].low, region.extent[name].high) for name in inputs]
-        along = [f"{name} {number(low, 3)} to {measured('', high, units.get(name, '')).strip()}" for name, low, high in ends]
+        along = []
+        for name in inputs:
+            ends = (region.extent[name].low, region.extent[name].high)
+            low, high = (input_value(end, widths.get(name, np.inf)) for end in ends)
+            along.append(f"{name} {low} to {measured('', high, units.get(name, '')).strip()}")
         told.append(f"{percent(region.share)} of the parameter space, nine tenths of it with {' and '.join(along)}")
     small = "" if len(large) == len(regions) else f" ({plural(len(regions) - len(large), 'smaller one')} aside)"
     largest = "" if len(large) <= _TOLD else f", the {_TOLD} largest of them"

@@ -30,7 +30,7 @@ from sbt.campaigns.reconciling import denial, ends, nowhere_likely, reconciled
 from sbt.campaigns.records import CONFIRM
 from sbt.campaigns.regions import regions_words
 from sbt.campaigns.sides import all_critical, few_of_a_side, met, none_critical, safe_runs
-from sbt.campaigns.wording import estimating, measured, number, percent, plural, requirement_words, widening
+from sbt.campaigns.wording import estimating, input_widths, measured, number, percent, plural, requirement_words, widening
 from sbt.estimators.binomial import interval, unmet_draws
 from sbt.loop.stages import Facts
 
@@ -108,12 +108,12 @@ def tell_boundary(found: BoundaryConclusion, measured_share: CriticalShare, fact
         )
     else:
         sure = "no held-out run tested it"
-    few = few_of_a_side(facts)
+    few, widths = few_of_a_side(facts), input_widths(facts.history)
     if found.place is not None and found.chance_place is None:
-        section = found.place.words(facts.units)
+        section = found.place.words(facts.units, widths)
         unsharp = bool(few) or found.place.vague
         regions = () if unsharp or found.regions is None else found.regions  # roughness would be counted
-        where = regions_words(regions, found.place.inputs, facts.units) or section
+        where = regions_words(regions, found.place.inputs, facts.units, widths) or section
         lead = f"{_of(facts, 'In').strip() or 'Here'}, a run is critical ({_condition(facts)}) where {where}"
         if unsharp:
             why = few or "edges are less certain than the critical part is wide"
@@ -124,7 +124,7 @@ def tell_boundary(found: BoundaryConclusion, measured_share: CriticalShare, fact
     else:
         lead = nowhere_likely(found, _of(facts), _condition(facts), few)
     if found.chance_place is not None:
-        lead = found.chance_place.words(_of(facts, "In").strip() or "Here", _condition(facts), facts.units)
+        lead = found.chance_place.words(_of(facts, "In").strip() or "Here", _condition(facts), facts.units, widths)
     if none_critical(facts):
         lead = f"No run{_of(facts)} was critical ({_condition(facts)}), and the metamodel knows no place where one is likely"
     elif all_critical(facts):

@@ -7,15 +7,20 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from sbt.problem.combination import CombinedRequirement
 from sbt.problem.requirement import Requirement
+from sbt.store.history import History
 
 __all__ = [
-    "NOTHING", "estimating", "measured", "mixture_shares", "number", "percent", "plural", "requirement_words", "widening",
-    "written_unit",
+    "NOTHING", "digits_of", "estimating", "input_value", "input_widths", "measured", "mixture_shares", "narrow_digits",
+    "number", "percent", "plural", "requirement_words", "widening", "written_unit",
 ]  # fmt: skip
 
 _NIL = 1e-30  # a rounding error of what is zero
+_PLAIN, _MOST_DIGITS = 6, 16  # digits before the point that are written out; those that a double has
+_EXACT = 1e9  # below it whole numbers are written out
 _NO_SHARE = 1e-15  # a share that is a tail of a metamodel's, and nothing else
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 NOTHING = "\N{EN DASH}"
@@ -34,6 +39,53 @@ def number(value: Any, digits: int = 4) -> str:
         return str(value)
     value = 0.0 if isinstance(value, float) and abs(value) < _NIL else value
     return f"{value:,}" if isinstance(value, int) else f"{value:.{digits}g}"
+
+
+def digits_of(value: float, width: float = math.inf, digits: int = 3, sure: float = math.inf) -> int:
+    """Return how many significant digits tell a value of an input: so many, or more where the range is narrow.
+
+    Rounding is to change it by at most 1 % of the range where three digits are asked (each more: a tenth of that), and by no
+    more than it is uncertain; thousands are written out.
+
+    Args:
+        value: finite, not 0.
+        width: of the input's range.
+        digits: that are enough where the range begins at 0.
+        sure: how uncertain the value is.
+    """
+    before = math.floor(math.log10(abs(value))) + 1
+    finest = 2.0 * min(width * 10.0 ** (1 - digits) if width > 0.0 else math.inf, sure if sure > 0.0 else math.inf)
+    after = before - math.floor(math.log10(finest)) if math.isfinite(finest) else 0
+    return min(max(digits, after, before if before <= _PLAIN else 0), _MOST_DIGITS)
+
+
+def input_value(value: Any, width: float = math.inf, digits: int = 3, sure: float = math.inf) -> str:
+    """Return a value of an input for people, see `digits_of`; whole numbers in full.
+
+    >>> input_value(3605.6249, 10.0), input_value(0.33912, 1.0), input_value(3605.6249), input_value("truck")
+    ('3605.6', '0.339', '3606', 'truck')
+    """
+    if not isinstance(value, float) or not math.isfinite(value) or abs(value) < _NIL:
+        return number(value, digits)
+    if value.is_integer() and abs(value) < _EXACT:
+        return f"{value:.0f}"
+    return number(value, digits_of(value, width, digits, sure))
+
+
+def input_widths(history: History) -> dict[str, float]:
+    """Return how far the values of each input reach in these runs, which digits follow from; infinite where they are alike."""
+    if len(history) == 0:
+        return {}
+    widths = np.ptp(history.x, axis=0)
+    return {name: float(width) if width > 0.0 else math.inf for name, width in zip(history.names, widths, strict=True)}
+
+
+def narrow_digits(inputs: Mapping[str, Any], widths: Mapping[str, float]) -> dict[str, int]:
+    """Return how many significant digits tell values of inputs of a narrow range, of those alone that three do not tell."""
+    numbers = {name: value for name, value in inputs.items() if isinstance(value, float) and abs(value) >= _NIL}
+    finite = {name: value for name, value in numbers.items() if math.isfinite(value)}
+    digits = {name: digits_of(value, widths.get(name, math.inf)) for name, value in finite.items()}
+    return {name: n for name, n in digits.items() if n > digits_of(finite[name])}
 
 
 def percent(value: float) -> str:

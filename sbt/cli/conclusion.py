@@ -76,13 +76,13 @@ def _answer(result: Mapping[str, Any]) -> list[str]:
 
 def _mode(mode: Mapping[str, Any], metric: str, units: Mapping[str, str]) -> str:
     """Return a failure mode on one line."""
-    from sbt.campaigns.wording import plural
+    from sbt.campaigns.wording import input_value, plural
 
     def measured(name: str, value: Any) -> str:
         return f"{name} {_short(value)} {_unit(units.get(name, ''))}".rstrip()
 
-    inputs = list(mode["inputs"].items())
-    told = [measured(name, value) for name, value in inputs[:_MOST_INPUTS]]
+    inputs, digits = list(mode["inputs"].items()), mode.get("digits") or {}
+    told = [measured(name, input_value(value, digits=digits.get(name, 3))) for name, value in inputs[:_MOST_INPUTS]]
     if len(inputs) > _MOST_INPUTS:
         told.append(f"and {plural(len(inputs) - _MOST_INPUTS, 'more input')}")
     said = [f"run {mode['representative']}, {measured(metric, mode['metric'])}, at {', '.join(told)}"]
@@ -141,7 +141,11 @@ def _values(conclusion: Mapping[str, Any]) -> list[str]:
 
 def _record(item: Mapping[str, Any]) -> str:
     """Return the numbers of a record on one line, those of its inputs by their own names."""
-    values = {k: v for k, v in item.items() if isinstance(v, (int, float, str))} | dict(item.get("inputs", {}))
+    from sbt.campaigns.wording import input_value
+
+    digits = item.get("digits") or {}
+    inputs = {name: input_value(value, digits=max(digits.get(name, 4), 4)) for name, value in item.get("inputs", {}).items()}
+    values = {k: v for k, v in item.items() if isinstance(v, (int, float, str))} | inputs
     found = [f"{name} {shown(value)}" for name, value in values.items()]
     if item.get("preventable"):
         found.append(_avoided(item["preventable"]))

@@ -72,7 +72,9 @@ def sensitivity_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
         return []
     head = ("input", "parameter", "value", "dP/dvalue", "+-", "elasticity", "change", "P raised", "P lowered")
     keys = ("input", "parameter", "value", "derivative", "std_error", "elasticity", "change", "raised", "lowered")
-    table = [head, *(tuple(_shown(row[key]) for key in keys) for row in rows)]
+    from sbt.campaigns.wording import input_value
+
+    table = [head, *(tuple(input_value(row[key]) if key == "value" else _shown(row[key]) for key in keys) for row in rows)]
     widths = [max(len(row[k]) for row in table) for k in range(len(head))]
     return ["  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in table]
 

@@ -65,7 +65,7 @@ def _table(*columns: str) -> Any:
 
 def _modes(result: Mapping[str, Any], width: int) -> Any:
     """Return the table of failure modes, with as many inputs as there is room for."""
-    from sbt.campaigns.wording import number, written_unit
+    from sbt.campaigns.wording import input_value, number, written_unit
 
     modes, units = result["conclusion"]["failure_modes"], result.get("units", {})
 
@@ -75,15 +75,17 @@ def _modes(result: Mapping[str, Any], width: int) -> Any:
 
     names, room = [], width - _BESIDE - len(result["metric"])
     for name in modes[0]["inputs"]:
-        room -= max(len(name), _NARROWEST) + 3
+        wide = max((mode.get("digits") or {}).get(name, 0) for mode in modes) + 1
+        room -= max(len(name), _NARROWEST, wide) + 3
         if room < 0:
             break
         names.append(name)
     table = _table("mode", "run", head(result["metric"]), *map(head, names), "critical\nruns", "critical\nagain")
     for k, mode in enumerate(modes, start=1):
-        again, n = mode.get("confirmed"), mode.get("confirmation_runs", 0)
+        again, n, digits = mode.get("confirmed"), mode.get("confirmation_runs", 0), mode.get("digits") or {}
+        inputs = [input_value(mode["inputs"][name], digits=digits.get(name, 3)) for name in names]
         table.add_row(
-            str(k), str(mode["representative"]), number(mode["metric"], 3), *(number(mode["inputs"][name], 3) for name in names),
+            str(k), str(mode["representative"]), number(mode["metric"], 3), *inputs,
             str(mode["size"]), "" if again is None else f"{round(again * n)} of {n - (mode.get('confirmations_lost') or 0)}",
         )  # fmt: skip
     return table

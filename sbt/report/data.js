@@ -57,7 +57,7 @@ const VERDICTS = ["not critical", "critical", "failed"];
 
 // Data as the page uses them: columns (inputs, then metrics) with values a row, verdicts, films by run.
 const opened = raw => {
-  const inputs = raw.inputs.map((column, k) => ({ ...column, input: true, values: floats(raw.x[k]) }));
+  const inputs = raw.inputs.map((column, k) => ({ ...column, input: true, values: column.origin ? Float64Array.from(floats(raw.x[k]), v => v + column.origin) : floats(raw.x[k]) }));
   const metrics = raw.metrics.map((column, k) => ({ ...column, choices: [], values: floats(raw.y[k]) }));
   const index = wholes(raw.index);
   const rowOf = new Map();
@@ -69,5 +69,5 @@ const opened = raw => {
 };
 const valueText = (column, row) => {
   const value = column.values[row];
-  return column.choices.length ? column.choices[Math.round(value)] ?? "\u2013" : digits(value, 5);
+  return column.choices.length ? column.choices[Math.round(value)] ?? "\u2013" : digits(value, column.digits || 5);
 };

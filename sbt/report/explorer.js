@@ -213,7 +213,7 @@ class Explorer {
     Object.assign(slider, { min: place_of(grid[0]), max: place_of(grid[grid.length - 1]), step: input.whole ? 1 : "any" });
     const tell = value => {
       const [mean, low, high, p] = move(value);
-      const written = input.choices.length ? input.choices[Math.round(value)] : withUnit(digits(value), input.unit);
+      const written = input.choices.length ? input.choices[Math.round(value)] : withUnit(digits(value, Math.max(input.digits - 1, 4)), input.unit);
       says.textContent = `${input.name} = ${written}, else as run ${run}: ${data.told.name} ${digits(mean, 3)} `
         + `(90 % between ${digits(low, 3)} and ${withUnit(digits(high, 3), data.told.unit)}), P(critical) ${percent(p)}`;
     };

@@ -16,6 +16,7 @@ import numpy as np
 
 from sbt.campaigns.failures import FalsificationConclusion
 from sbt.campaigns.modes import worst_first
+from sbt.campaigns.wording import digits_of
 from sbt.problem.parameter import Parameter
 from sbt.problem.plain import Json, JsonMapping
 from sbt.problem.scenario import LogicalScenario
@@ -34,6 +35,10 @@ _SLICES = 40
 """Slices go through at most so many runs."""
 _WORST = 8
 """... so many of the most critical ones among them."""
+_NARROW = 0.01
+"""Width of a range relative to its ends below which it is narrow."""
+_DIGITS = 5
+"""Significant digits of an input's values where its range begins at 0."""
 _SCRIPTS = ("data.js", "charts.js", "table.js", "sight.js", "film.js", "explorer.js")
 _STYLES = ("explorer.css",)
 
@@ -74,7 +79,7 @@ def explorer_data(
         "order": np.argsort(-np.asarray(weights), kind="stable").tolist(),
         "index": _whole(shown.index), "verdict": verdict.tolist(), "margin": _floats(margin),
         "rank": _whole(np.argsort(worst_first(shown, requirement.depths(shown)), kind="stable")),
-        "x": [_floats(shown.x[:, k]) for k in range(shown.x.shape[1])],
+        "x": [_floats(shown.x[:, k] - _origin(p)) for k, p in enumerate(scenario.space.parameters)],
         "y": [_floats(shown.y(m)) for m in history.metrics],
         "stages": stages, "stage": [stages.index(s) for s in shown.stage.tolist()],
         "iteration": _whole(shown.iteration), "seed": [str(s) for s in shown.seed.tolist()],
@@ -105,9 +110,22 @@ def _input(parameter: Parameter, k: int, influence: Influence | None) -> Json:
     }  # fmt: skip
     return {
         "name": parameter.name, "unit": parameter.unit, "low": _number(low), "high": _number(high),
+        "origin": _origin(parameter), "digits": _digits(parameter),
         "choices": list(parameter.choices), "whole": parameter.discrete, "log": parameter.logarithmic,
         "description": parameter.description, **known,
     }  # fmt: skip
+
+
+def _origin(parameter: Parameter) -> float:
+    """Return what is subtracted from an input's values, of which seven digits are kept: 0 but for a narrow range."""
+    low, high = parameter.bounds
+    return low if high - low < _NARROW * max(abs(low), abs(high)) else 0.0
+
+
+def _digits(parameter: Parameter) -> int:
+    """Return the significant digits in which an input's values are written."""
+    low, high = parameter.bounds
+    return digits_of(max(abs(low), abs(high)), high - low, _DIGITS)
 
 
 def _modes(found: Findings) -> list[Json]:

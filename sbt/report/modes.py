@@ -10,7 +10,7 @@ import numpy as np
 from sbt.campaigns.failures import FalsificationConclusion
 from sbt.campaigns.modes import FailureMode
 from sbt.campaigns.preventable import KNOWN_LIMITS, describe_judgements
-from sbt.campaigns.wording import NOTHING, number, percent, written_unit
+from sbt.campaigns.wording import NOTHING, input_widths, number, percent, written_unit
 from sbt.problem.arrays import Vector
 from sbt.problem.plain import Value
 from sbt.problem.space import ParameterSpace
@@ -37,7 +37,7 @@ def mode_table(found: Findings, space: ParameterSpace) -> Table:
     """Return one row a failure mode; no rows where the campaign found none or does not look for them."""
     modes, several = _modes(found), found.requirement.combined
     rows, typed = [], any(mode.conflict for mode in modes)
-    judged = any(mode.preventable for mode in modes)
+    judged, widths = any(mode.preventable for mode in modes), input_widths(found.history)
     doubtful = any(mode.unconfirmed for mode in modes)
     for number_of, mode in enumerate(modes, 1):
         confirmed = NOTHING if mode.confirmed is None else f"{percent(mode.confirmed)} of {mode.confirmation_runs}"
@@ -47,7 +47,7 @@ def mode_table(found: Findings, space: ParameterSpace) -> Table:
             *((Cell(violated_words(mode)),) if several else ()), Cell.of(mode.size), Cell(confirmed),
             *(() if not doubtful else (Cell.of(mode.unconfirmed),)),
             *(() if not typed else (Cell(mode.conflict or NOTHING),)),
-            *(_input(mode, name) for name in space.names), Cell(_change(mode, space)),
+            *(_input(mode, name, widths.get(name, math.inf)) for name in space.names), Cell(_change(mode, space)),
             *((Cell(describe_judgements(mode.preventable or ()) or NOTHING),) if judged else ()), Cell.of(mode.most_likely.run),
         ))  # fmt: skip
     metric = found.requirement.told_as
@@ -60,10 +60,10 @@ def mode_table(found: Findings, space: ParameterSpace) -> Table:
     return Table(columns, tuple(rows), note if rows else "")
 
 
-def _input(mode: FailureMode, name: str) -> Cell:
+def _input(mode: FailureMode, name: str, width: float) -> Cell:
     """Return an input of the representative, with the other choices that the mode's runs have."""
     others = [choice for choice in (mode.choices or {}).get(name, ()) if choice != mode.inputs[name]]
-    return Cell(f"{mode.inputs[name]}, also {', '.join(others)}") if others else Cell.of(mode.inputs[name])
+    return Cell(f"{mode.inputs[name]}, also {', '.join(others)}") if others else Cell.of_input(mode.inputs[name], width)
 
 
 def violated_words(mode: FailureMode) -> str:

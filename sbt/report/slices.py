@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from sbt.campaigns.wording import input_value
 from sbt.metamodels.ended import ended
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.parameter import Parameter
@@ -70,8 +71,10 @@ def slices_through(
                 guess, true = np.interp(values, grids[k], part[q, row, there]), part[q, row]
                 miss = np.abs(ndtr(guess) - ndtr(true)) if q == 3 else np.abs(guess - true)
                 errors[q] = max(errors[q], float(np.nanmax(miss, initial=0.0)))
+    widths = [p.bounds[1] - p.bounds[0] for p in space.parameters]
     return {
-        "grid": [[float(f"{v:.6g}") for v in g] for g in grids], "runs": list(runs[:kept]), "of": found,
+        "grid": [[float(input_value(float(v), w, 6)) for v in g] for w, g in zip(widths, grids, strict=True)],
+        "runs": list(runs[:kept]), "of": found,
         "error_p": float(f"{errors[3]:.2g}"), "error_mean": float(f"{errors[:3].max():.2g}"),
     }  # fmt: skip
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,10 +13,10 @@ import numpy as np
 from sbt.campaigns.asking import Sensitivity
 from sbt.campaigns.modes import worst_first
 from sbt.campaigns.preventable import KNOWN_LIMITS, describe_judgements
-from sbt.campaigns.wording import NOTHING, mixture_shares, number, percent, written_unit
+from sbt.campaigns.wording import NOTHING, input_value, input_widths, mixture_shares, number, percent, written_unit
 from sbt.problem.outcome import doubts
 from sbt.problem.parameter import Parameter
-from sbt.problem.plain import JsonMapping
+from sbt.problem.plain import JsonMapping, Value
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
 from sbt.report.influence import Influence
@@ -53,6 +54,11 @@ class Cell:
         """Return the cell of a number or a text."""
         is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
         return cls(number(value, digits), value if is_number else None)
+
+    @classmethod
+    def of_input(cls, value: Value, width: float = math.inf) -> Cell:
+        """Return the cell of an input's value, whose range is so wide."""
+        return cls(input_value(value, width, 4), None if isinstance(value, str) else value)
 
     @property
     def numeric(self) -> bool:
@@ -100,10 +106,11 @@ def input_table(scenario: LogicalScenario, influence: Influence | None) -> Table
 
 
 def _input(parameter: Parameter) -> tuple[Cell, ...]:
+    low, high = (input_value(float(end), parameter.high - parameter.low, 6) for end in (parameter.low, parameter.high))
     scale = ", whole numbers" if parameter.kind == "integer" else ", logarithmic" if parameter.logarithmic else ""
     return (
         Cell(parameter.name),
-        Cell(", ".join(parameter.choices) or f"[{parameter.low:g}, {parameter.high:g}]{scale}"),
+        Cell(", ".join(parameter.choices) or f"[{low}, {high}]{scale}"),
         Cell(written_unit(parameter.unit) or NOTHING),
         Cell(distribution_words(parameter)),
         Cell(parameter.description),
@@ -114,8 +121,9 @@ def sensitivity_table(rows: Sequence[Sensitivity]) -> Table:
     """Return what each parameter of the distributions does to the probability P, that which matters most first."""
     columns = ("input", "parameter", "value", "dP / dvalue", "std. error", "elasticity", "change", "P, raised", "P, lowered")
     cells = tuple(
-        (Cell(each.input), Cell(each.parameter), Cell.of(each.value), Cell.of(each.derivative, 3), Cell.of(each.std_error, 2),
-         Cell.of(each.elasticity, 3), Cell.of(each.change, 3), Cell.of(each.raised, 3), Cell.of(each.lowered, 3))
+        (Cell(each.input), Cell(each.parameter), Cell.of_input(each.value), Cell.of(each.derivative, 3),
+         Cell.of(each.std_error, 2), Cell.of(each.elasticity, 3), Cell.of(each.change, 3), Cell.of(each.raised, 3),
+         Cell.of(each.lowered, 3))
         for each in rows
     )  # fmt: skip
     note = (
@@ -188,13 +196,13 @@ def critical_table(history: History, requirement: Requirement, replay: str, judg
     margin, told = requirement.depths(history), requirement.told(history)
     found = [int(k) for k in worst_first(history, margin) if margin[k] <= 0]
     metrics = sorted(history.metrics, key=lambda name: name not in [part.metric for part in requirement.parts])
-    rows = []
+    rows, widths = [], input_widths(history)
     for k in found[:_MOST]:
         record = history.record(k)
         rows.append((
             Cell.of(record.index), Cell.of(float(margin[k]) if np.isfinite(told[k]) else None),
             *((Cell(", ".join(requirement.violated(record.metrics))),) if requirement.combined else ()),
-            *(Cell.of(record.inputs[name]) for name in history.names),
+            *(Cell.of_input(record.inputs[name], widths[name]) for name in history.names),
             *(Cell.of(record.metrics.get(name)) for name in metrics), Cell(str(record.seed), record.seed),
             *((Cell(describe_judgements(judged.get(record.index, ())) or NOTHING),) if judged else ()),
             Cell("command", code=of_run(replay, record.index)),

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from sbt.campaigns.wording import measured, number, percent, plural, written_unit
+from sbt.campaigns.wording import input_value, measured, percent, plural, written_unit
 from sbt.files import write_atomically
 from sbt.problem.plain import Json
 from sbt.report.explorer import library, packed, render, scripts, styles
@@ -38,17 +39,20 @@ def write_versus(
     import markupsafe
 
     reels, inputs = Reels(), {(kind, found["run"]): found["inputs"] for kind in ("fixed", "new") for found in result[kind]}
+    widths = _widths(list(inputs.values()))
     pairs = [
         {
             "title": f"{kind}: run {before.run}", "films": [reels.add(before), reels.add(after)],
-            "said": [film.role for film in (before, after)], "inputs": _inputs(inputs[kind, before.run], units),
+            "said": [film.role for film in (before, after)], "inputs": _inputs(inputs[kind, before.run], units, widths),
         }
         for kind, before, after in films
     ]  # fmt: skip
     page = render("versus.html", {
         "title": title, "lead": _lead(result), "sentences": _sentences(result), **_bars(result), "note": note,
         "commands": commands,
-        "tables": [_table("Fixed failures", result["fixed"], units), _table("New failures", result["new"], units)],
+        "tables": [
+            _table(f"{kind.capitalize()} failures", result[kind], units, widths) for kind in ("fixed", "new")
+        ],
         "explorer": {
             "data": packed({"pairs": pairs, "lanes": reels.lanes}), "library": library() if pairs else "",
             "styles": markupsafe.Markup(styles()),
@@ -100,14 +104,25 @@ def _bars(result: Mapping[str, Any]) -> Json:
     return {"bars": bars, "zero": place(0.0)}
 
 
-def _inputs(inputs: Mapping[str, Any], units: Mapping[str, str]) -> str:
-    return ", ".join(measured(name, value, units.get(name, ""), 4) for name, value in inputs.items())
+def _widths(inputs: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """Return how far the values of each input reach in these runs; infinite where they are all alike."""
+    numeric = [name for name, value in (inputs[0] if inputs else {}).items() if not isinstance(value, str)]
+    numbers = {name: [each[name] for each in inputs] for name in numeric}
+    return {name: (max(values) - min(values)) or math.inf for name, values in numbers.items()}
 
 
-def _table(title: str, found: Sequence[Mapping[str, Any]], units: Mapping[str, str]) -> Json:
+def _inputs(inputs: Mapping[str, Any], units: Mapping[str, str], widths: Mapping[str, float]) -> str:
+    told = {name: input_value(value, widths.get(name, math.inf), 4) for name, value in inputs.items()}
+    return ", ".join(measured(name, value, units.get(name, "")) for name, value in told.items())
+
+
+def _table(title: str, found: Sequence[Mapping[str, Any]], units: Mapping[str, str], widths: Mapping[str, float]) -> Json:
     names = list(found[0]["inputs"]) if found else []
     return {
         "title": title, "count": f"{len(found):,}" + (f", the first {_LISTED}" if len(found) > _LISTED else ""),
         "columns": ["run", *(f"{n} ({written_unit(units[n])})" if units.get(n) else n for n in names), "seed"],
-        "rows": [[r["run"], *(number(r["inputs"][n], 5) for n in names), r["seed"]] for r in found[:_LISTED]],
+        "rows": [
+            [r["run"], *(input_value(r["inputs"][n], widths.get(n, math.inf), 5) for n in names), r["seed"]]
+            for r in found[:_LISTED]
+        ],
     }  # fmt: skip

@@ -11,7 +11,7 @@ from typing import Any
 from sbt.campaigns.failures import FalsificationConclusion
 from sbt.campaigns.lost import nothing_known
 from sbt.campaigns.parts import share_among_held_out
-from sbt.campaigns.wording import number, percent, requirement_words, written_unit
+from sbt.campaigns.wording import input_value, number, percent, requirement_words, written_unit
 from sbt.estimators.binomial import upper
 from sbt.loop.stages import Conclusion, Facts, few_combinations, notes_of, sentences_of
 from sbt.problem.outcome import Doubt
@@ -131,8 +131,9 @@ def distribution_words(parameter: Parameter) -> str:
     distribution = parameter.distribution
     if distribution is None or distribution.kind == "uniform":
         return "uniform"
-    values = ((name, value if isinstance(value, str) else f"{value:g}") for name, value in distribution.parameters)
-    parameters = ", ".join(f"{name} {value}" for name, value in values)
+    width = parameter.bounds[1] - parameter.bounds[0]
+    given = {name: value if isinstance(value, str) else float(value) for name, value in distribution.parameters}
+    parameters = ", ".join(f"{name} {input_value(value, width, 6)}" for name, value in given.items())
     return f"{distribution.kind} ({parameters})" if parameters else distribution.kind
 
 
