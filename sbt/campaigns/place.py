@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import expit
@@ -30,8 +30,14 @@ _CROSSINGS = 64
 _STEP = 0.002  # of the unit cube, to both sides, for the direction of the steepest change
 _GIVES = 0.8  # P(a run gives a metric) below which it is said that runs may fail there
 _CELLS = 400  # of a line on which edges are looked for
-_CUTS = (0.1, 0.5, 0.9)  # quantiles of the second input along the boundary
-_APART = 1e-3  # of how far lines reach: those that are nearer are one
+_CUTS = ((0.1, 0.2), (0.5, 0.4, 0.6), (0.9, 0.8))
+"""Quantiles of the second input along the boundary, where lines along the first cross it: the first, or the next ones instead."""
+_ACROSS = (0.5, 0.4, 0.6, 0.3, 0.7, 0.2, 0.8)  # the same of the first one, where the boundary is a face across the second
+_ALONG = 0.2  # of the first input's mean share of the direction across the boundary: below it a line runs along the boundary
+_FACE, _FACES = 0.99, 0.1  # share of the second input's from which on the boundary is a face across it; of points on such
+_ALIKE = 8  # points of the boundary with the same choices and whole numbers that tell its cuts
+_APART = 1e-3  # of the unit cube: cuts that are nearer are one
+_HALVINGS = 20  # of a cell of a line, for where P crosses 0.5
 _MOST = 1e6  # log odds beyond which nothing is told apart
 _SURE = 0.95  # outside of this and its complement the metamodel is sure of a side
 
@@ -71,6 +77,8 @@ class BoundaryPlace:
         cuts: lines along the first input, at values of the second.
         fixed: what the other inputs are meanwhile: those of a point of the boundary, in the midst of it.
         weights: of every continuous input, its mean share of the direction across the boundary, squared (unit cube).
+        across: a line along the second input, where a part of the boundary is a face across it, which no line along the first
+            meets; None: none is.
     """
 
     inputs: tuple[str, ...]
@@ -79,11 +87,13 @@ class BoundaryPlace:
     cuts: tuple[Cut, ...]
     fixed: Mapping[str, Value]
     weights: Mapping[str, float]
+    across: BoundaryPlace | None = optional()
 
     @property
     def vague(self) -> bool:
         """Whether an edge is less certain than the critical stretch beside it is wide."""
-        return any(cut.unsure >= min(s.high - s.low for s in cut.critical) for cut in self.cuts)
+        own = any(cut.unsure >= min(s.high - s.low for s in cut.critical) for cut in self.cuts)
+        return own or (self.across is not None and self.across.vague)
 
     def words(self, units: Mapping[str, str], widths: Mapping[str, float] | None = None, *, edges: bool = True) -> str:
         """Return where critical meets uncritical, in words.
@@ -95,6 +105,8 @@ class BoundaryPlace:
         """
         widths = widths or {}
         said = self._lines(units, widths, edges=edges)
+        if self.across is not None:
+            said += f", and where {self.across._lines(units, widths, edges=edges)}"
         if self.fixed:
             names = sorted(self.fixed, key=lambda name: -self.weights.get(name, 0.0))
             values = {name: input_value(self.fixed[name], widths.get(name, np.inf)) for name in names[:_MOST_FIXED]}
@@ -147,33 +159,99 @@ def boundary_place(
 ) -> BoundaryPlace | None:
     """Return where the boundary lies; None where the metamodel sees none among runs that succeed, or no input is continuous."""
     space = scenario.space
-
-    def probability(v: Points) -> Vector:
-        return np.asarray(expit(log_odds(v)), dtype=np.float64)
-
     continuous = [k for k, p in enumerate(space.parameters) if p.kind == "continuous"]
     u = SobolSequence(space.dimension, seed).admissible(lambda v: space.feasible(space.from_unit(v)), _LOOK_FROM, 256)
     if not continuous or len(u) == 0:
         return None
-    edge = space.cube.snapped(crossings(probability, space.cube.snapped(u), _CROSSINGS))
+    seen = _Seen(log_odds, log_success, space, continuous)
+    edge = space.cube.snapped(crossings(seen.probability, space.cube.snapped(u), _CROSSINGS))
     edge = edge[space.feasible(space.from_unit(edge))] if len(edge) else edge
     edge = edge[succeeding(log_success, edge)]
     if len(edge) == 0:
         return None
-    weight = _weights(log_odds, edge, continuous)
+    share = seen.shares(edge)
+    weight = share.mean(axis=0)
     order = sorted(range(len(continuous)), key=lambda k: -weight[k])[:2]
-    axes = [continuous[k] for k in order]
-    anchor = edge[np.argmin(np.linalg.norm(edge - np.median(edge, axis=0), axis=1))]
-    parameter = space.parameters[axes[0]]
-    values = np.quantile(edge[:, axes[1]], _CUTS) if len(axes) > 1 else np.empty(0)
-    lines = [_with(anchor, axes[1], value) for value in values] or [anchor]
-    cuts = [_cut(probability, log_success, line, axes, space) for line in lines]
-    low, high = (float(v) for v in parameter.from_unit(np.array([0.0, 1.0])))
-    cuts = [cut for cut in cuts if cut.critical and not _everywhere(cut, low, high)]
-    names, row = [space.names[k] for k in axes], space.named(space.from_unit(anchor[None])[0])
-    fixed = {name: row[name] for name in space.names if name not in names}
+    least = _ALONG * weight[order[0]]
+    meets = share[:, order[0]] >= least
+    anchor = edge[meets][np.argmin(np.linalg.norm(edge[meets] - np.median(edge[meets], axis=0), axis=1))]
+    alike = (space.cube.cells(edge) == space.cube.cells(anchor[None])).all(axis=1)
+    alike = alike if (meets & alike).sum() >= _ALIKE else np.ones(len(edge), dtype=bool)
+    cuts = seen.cuts(anchor, edge[meets & alike], order, _CUTS, least)
+    if not cuts:
+        return None
+    found, across, face = seen.place(order, cuts), None, alike & (share[:, order[-1]] >= _FACE)
+    if len(order) > 1 and face.sum() >= _FACES * alike.sum():
+        beside = seen.cuts(anchor, edge[face], order[::-1], (_ACROSS,), 0.5)
+        across = seen.place(order[::-1], beside) if beside else None
+    row = space.named(space.from_unit(anchor[None])[0])
+    fixed = {name: row[name] for name in space.names if name not in found.inputs}
     shares = {space.names[k]: float(w) for k, w in zip(continuous, weight, strict=True)}
-    return BoundaryPlace(tuple(names), low, high, tuple(cuts), fixed, shares) if cuts else None
+    return replace(found, fixed=fixed, weights=shares, across=across)
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """P(critical) as a metamodel sees it in a space, some inputs of which are continuous."""
+
+    log_odds: LogOdds
+    log_success: LogOdds | None
+    space: ParameterSpace
+    continuous: list[int]
+
+    def probability(self, v: Points) -> Vector:
+        """Return (n,) P(critical) at points of the unit cube."""
+        return np.asarray(expit(self.log_odds(v)), dtype=np.float64)
+
+    def cuts(
+        self, anchor: Vector, edge: Points, order: list[int], quantiles: Sequence[Sequence[float]], least: float
+    ) -> list[Cut]:
+        """Return lines along the first of two inputs through a point, at quantiles of the second one among points (n, d).
+
+        Of each group of quantiles it is the first whose line never runs along the boundary; where all do, the first of a group.
+
+        Args:
+            anchor: (d,) the point.
+            edge: of the boundary.
+            order: which of the continuous inputs.
+            quantiles: in groups.
+            least: share of the first input of the direction across the boundary, below which a line runs along it.
+        """
+        axes = [self.continuous[k] for k in order]
+        low, high = self.space.parameters[axes[0]].bounds
+        every, meeting = [], []
+        taken: list[float] = []
+        for group in quantiles if len(axes) > 1 else [(0.0,)]:
+            values = np.quantile(edge[:, axes[1]], group).tolist() if len(axes) > 1 else [anchor[axes[0]]]
+            values = [value for value in values if len(axes) < 2 or all(abs(value - other) > _APART for other in taken)]
+            for k, value in enumerate(values):
+                line = _with(anchor, axes[-1], value)
+                cut = _cut(self.probability, self.log_success, line, axes, self.space)
+                if not cut.critical or _everywhere(cut, low, high):
+                    break
+                every += [cut] if k == 0 else []
+                if (self.shares(_crossings_of(self.probability, line, axes[0]))[:, order[0]] >= least).all():
+                    meeting.append(cut)
+                    taken.append(value)
+                    break
+        return meeting or every
+
+    def place(self, order: list[int], cuts: Sequence[Cut]) -> BoundaryPlace:
+        """Return lines along the first of two inputs as a place."""
+        inputs = [self.space.parameters[self.continuous[k]] for k in order]
+        low, high = inputs[0].bounds
+        return BoundaryPlace(tuple(p.name for p in inputs), float(low), float(high), tuple(cuts), {}, {})
+
+    def shares(self, edge: Points) -> Points:
+        """Return (n, c) the share of each continuous input of the direction in which P(critical) changes at n points, squared."""
+        change = np.empty((len(edge), len(self.continuous)))
+        for k, axis in enumerate(self.continuous):
+            up, down = (_moved(edge, axis, step) for step in (_STEP, -_STEP))
+            rise = _finite(self.log_odds(up)) - _finite(self.log_odds(down)) if len(edge) else np.empty(0)
+            change[:, k] = rise / np.maximum(up[:, axis] - down[:, axis], 1e-12)
+        squared = change**2
+        total = squared.sum(axis=1, keepdims=True)
+        return np.where(total > 0, squared / np.where(total > 0, total, 1.0), 0.0)
 
 
 def succeeding(log_success: LogOdds | None, u: Points, least: float = 0.5) -> Mask:
@@ -183,15 +261,23 @@ def succeeding(log_success: LogOdds | None, u: Points, least: float = 0.5) -> Ma
     return np.asarray(log_success(u) >= np.log(least))
 
 
-def _weights(log_odds: LogOdds, edge: Points, continuous: list[int]) -> Vector:
-    """Return (c,) the share of each continuous input of the direction in which P(critical) changes, squared, mean over points."""
-    change = np.empty((len(edge), len(continuous)))
-    for k, axis in enumerate(continuous):
-        up, down = (_moved(edge, axis, step) for step in (_STEP, -_STEP))
-        change[:, k] = (_finite(log_odds(up)) - _finite(log_odds(down))) / np.maximum(up[:, axis] - down[:, axis], 1e-12)
-    squared = change**2
-    total = squared.sum(axis=1, keepdims=True)
-    return np.where(total > 0, squared / np.where(total > 0, total, 1.0), 0.0).mean(axis=0)
+def _crossings_of(probability: Probability, line: Vector, axis: int) -> Points:
+    """Return (m, d) where P crosses 0.5 on a line along an input."""
+    t = np.linspace(0.0, 1.0, _CELLS + 1)
+    side = probability(_on(line, axis, t)) > 0.5
+    cell = np.flatnonzero(side[1:] != side[:-1])
+    low, high = t[cell], t[cell + 1]
+    for _ in range(_HALVINGS if len(cell) else 0):
+        middle = 0.5 * (low + high)
+        same = (probability(_on(line, axis, middle)) > 0.5) == side[cell]
+        low, high = np.where(same, middle, low), np.where(same, high, middle)
+    return _on(line, axis, 0.5 * (low + high))
+
+
+def _on(line: Vector, axis: int, t: Vector) -> Points:
+    points = np.repeat(line[None], len(t), axis=0)
+    points[:, axis] = t
+    return points
 
 
 def _finite(log_odds: Vector) -> Vector:
@@ -213,8 +299,7 @@ def _with(point: Vector, axis: int, value: float) -> Vector:
 def _cut(probability: Probability, log_success: LogOdds | None, line: Vector, axes: list[int], space: ParameterSpace) -> Cut:
     """Return the critical stretches of the first axis through a point, as far as constraints admit them; none of all of that."""
     t = np.linspace(0.0, 1.0, _CELLS + 1)
-    points = np.repeat(line[None], len(t), axis=0)
-    points[:, axes[0]] = t
+    points = _on(line, axes[0], t)
     p, admitted = probability(points), space.feasible(space.from_unit(points))
     ok = succeeding(log_success, points) & admitted & ~(not admitted.all() and bool((p > 0.5)[admitted].all()))
     x = space.parameters[axes[0]].from_unit(t)
