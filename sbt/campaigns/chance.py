@@ -72,7 +72,7 @@ def chance_place(log_odds: LogOdds, scenario: LogicalScenario, seed: int, u: Poi
     if hit[there].sum() < _FEWEST or _as_elsewhere(hit, there) > _CHANCE:
         return None
     place = boundary_place(lambda v: log_odds(v) - above, scenario, seed)
-    if place is None:
+    if place is None or not place.cuts:
         return None
     return ChancePlace(place, int(there.sum()), int(hit[there].sum()))
 

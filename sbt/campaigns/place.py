@@ -178,10 +178,10 @@ def boundary_place(
     alike = (space.cube.cells(edge) == space.cube.cells(anchor[None])).all(axis=1)
     alike = alike if (meets & alike).sum() >= _ALIKE else np.ones(len(edge), dtype=bool)
     cuts = seen.cuts(anchor, edge[meets & alike], order, _CUTS, least)
-    if not cuts:
+    if not cuts and space.cube.continuous:
         return None
     found, across, face = seen.place(order, cuts), None, alike & (share[:, order[-1]] >= _FACE)
-    if len(order) > 1 and face.sum() >= _FACES * alike.sum():
+    if cuts and len(order) > 1 and face.sum() >= _FACES * alike.sum():
         beside = seen.cuts(anchor, edge[face], order[::-1], (_ACROSS,), 0.5)
         across = seen.place(order[::-1], beside) if beside else None
     row = space.named(space.from_unit(anchor[None])[0])

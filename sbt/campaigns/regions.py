@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,10 +14,13 @@ from scipy.spatial.distance import cdist
 from sbt.campaigns.place import LogOdds, Stretch, succeeding
 from sbt.campaigns.wording import input_value, measured, percent, plural
 from sbt.problem.arrays import Mask, Points
+from sbt.problem.plain import Value
 from sbt.problem.scenario import LogicalScenario
+from sbt.problem.space import ParameterSpace
 from sbt.samplers.sobol import SobolSequence
+from sbt.store.records import optional
 
-__all__ = ["CriticalRegion", "critical_regions", "regions_words"]
+__all__ = ["CriticalRegion", "critical_regions", "only_words", "regions_words"]
 
 _POINTS, _LEAST, _MOST = 8192, 2048, 400  # of the space, that satisfy constraints, and critical ones that are joined
 _NEIGHBOURS, _BETWEEN = 8, 16  # pairs of points that are tried: of each point, and of each two parts, the nearest
@@ -26,6 +29,8 @@ _PARTS = 12  # the largest, which are tried in pairs
 _COUNTED = 3  # points that a region has at least: fewer may be the metamodel's roughness
 _TOLD, _LARGE = 3, 0.05  # regions in the sentence; share of all that is critical that one has at least to be named there
 _INNER = (0.05, 0.95)  # quantiles of its points between which a region is told to lie
+_SINGLE, _MOVED = 128, 64  # single values of an input that are tried, and points of a region that are moved to them
+_SOME = 0.05  # of the points critical at the value with most of them, from which on a region lies at a value
 
 
 @dataclass(frozen=True)
@@ -35,10 +40,13 @@ class CriticalRegion:
     Attributes:
         share: of the parameter space.
         extent: of each continuous input, where nine tenths of the region lie.
+        only: of inputs with choices or whole numbers at some of which the region does not lie: those at which it does;
+            None: it lies at all of them.
     """
 
     share: float
     extent: Mapping[str, Stretch]
+    only: Mapping[str, tuple[Value, ...]] | None = optional()
 
 
 def critical_regions(
@@ -68,12 +76,13 @@ def critical_regions(
 
     steps = np.linspace(0.0, 1.0, _PROBES + 2)[:-1, None]
 
+    def inside(v: Points) -> Mask:
+        return np.asarray((log_odds(v) > 0.0) & space.feasible(space.from_unit(v)))
+
     def joined(a: Points, b: Points) -> Mask:
         a = space.cube.with_choices_of(b, a)  # the way begins with the other ones
         probes = a[:, None] * (1.0 - steps) + b[:, None] * steps
-        probes = space.cube.snapped(probes.reshape(-1, u.shape[1]))
-        inside = (log_odds(probes) > 0.0) & space.feasible(space.from_unit(probes))
-        return np.asarray(inside.reshape(len(a), len(steps)).all(axis=1))
+        return np.asarray(inside(space.cube.snapped(probes.reshape(-1, u.shape[1]))).reshape(len(a), len(steps)).all(axis=1))
 
     label = _parts(critical, cdist(*[space.cube.embedded(critical)] * 2), joined)
     count = np.bincount(label)
@@ -87,28 +96,79 @@ def critical_regions(
         ends = np.quantile(x, _INNER, axis=0)
         ranges = zip(space.parameters, *ends.tolist(), strict=True)
         extent = {p.name: Stretch(low, high) for p, low, high in ranges if p.kind == "continuous"}
-        found.append(CriticalRegion(share * float(count[part]) / len(critical), extent))
+        only = _only(critical[label == part][:_MOVED], space, inside)
+        found.append(CriticalRegion(share * float(count[part]) / len(critical), extent, only or None))
     return tuple(found)
 
 
 def regions_words(
-    regions: tuple[CriticalRegion, ...], inputs: tuple[str, ...], units: Mapping[str, str], widths: Mapping[str, float]
+    regions: Sequence[CriticalRegion], inputs: Sequence[str], units: Mapping[str, str], widths: Mapping[str, float] | None = None
 ) -> str:
-    """Return how many regions there are, and where the largest lie along these inputs; nothing where one is nearly all."""
-    large = [region for region in regions if region.share >= _LARGE * sum(each.share for each in regions)]
+    """Return how many regions there are, and where the largest lie along these inputs; nothing where one is nearly all.
+
+    Choices and whole numbers to which a region is confined are told before.
+    """
+    large = _large(regions)
     if len(large) < 2:
         return ""
     told = []
     for region in large[:_TOLD]:
-        along = []
+        along = [_values(name, values, units) for name, values in (region.only or {}).items()]
         for name in inputs:
-            ends = (region.extent[name].low, region.extent[name].high)
-            low, high = (input_value(end, widths.get(name, np.inf)) for end in ends)
+            low, high = (
+                input_value(end, (widths or {}).get(name, np.inf)) for end in (region.extent[name].low, region.extent[name].high)
+            )
             along.append(f"{name} {low} to {measured('', high, units.get(name, '')).strip()}")
         told.append(f"{percent(region.share)} of the parameter space, nine tenths of it with {' and '.join(along)}")
     small = "" if len(large) == len(regions) else f" ({plural(len(regions) - len(large), 'smaller one')} aside)"
     largest = "" if len(large) <= _TOLD else f", the {_TOLD} largest of them"
     return f"it lies in one of {len(large)} separate regions{small}{largest}: {'; '.join(told)} (by the metamodel)"
+
+
+def only_words(regions: Sequence[CriticalRegion], units: Mapping[str, str]) -> str:
+    """Return the choices and whole numbers to which all that is critical is confined; nothing where it is found with all."""
+    large = _large(regions)
+    names = [name for name in (large[0].only or {}) if all(name in (region.only or {}) for region in large)] if large else []
+    values = {name: tuple(dict.fromkeys(value for region in large for value in (region.only or {})[name])) for name in names}
+    return " and ".join(_values(name, found, units) for name, found in values.items())
+
+
+def _large(regions: Sequence[CriticalRegion]) -> list[CriticalRegion]:
+    """Return the regions that are large enough to be named."""
+    return [region for region in regions if region.share >= _LARGE * sum(each.share for each in regions)]
+
+
+def _values(name: str, values: Sequence[Value], units: Mapping[str, str]) -> str:
+    """Return an input at some of its choices or whole numbers; those that follow one another as a range."""
+    numbers = [value for value in values if not isinstance(value, str)]
+    if len(numbers) > 1 and max(numbers) - min(numbers) == len(numbers) - 1:
+        return measured(name, f"{input_value(min(numbers))} to {input_value(max(numbers))}", units.get(name, ""))
+    return measured(name, " or ".join(map(input_value, sorted(numbers) or values)), units.get(name, ""))
+
+
+def _only(points: Points, space: ParameterSpace, inside: Callable[[Points], Mask]) -> dict[str, tuple[Value, ...]]:
+    """Return the choices and whole numbers at which a region lies, of inputs where it does not lie at all of them.
+
+    Its points (n, d) are moved to each: another choice is a step, and so is the next whole number.
+    """
+    found: dict[str, tuple[Value, ...]] = {}
+    for k, n in (*space.cube.whole, *space.cube.nominal):
+        if n > _SINGLE:
+            continue
+        moved = np.repeat(points, n, axis=0)
+        moved[:, k] = np.tile((np.arange(n) + 0.5) / n, len(points))
+        hits = inside(moved).reshape(len(points), n).sum(axis=0)
+        lies = hits >= max(_SOME * hits.max(), 1)
+        if (k, n) in space.cube.whole:
+            own = np.floor(points[:, k] * n).astype(int).clip(0, n - 1)
+            apart = np.flatnonzero(~lies)
+            below, above = apart[apart < own.min()], apart[apart > own.max()]
+            lies[: below.max(initial=-1) + 1], lies[above.min(initial=n) :] = False, False
+        if not lies.all():
+            parameter = space.parameters[k]
+            numbers = parameter.from_unit((np.flatnonzero(lies) + 0.5) / n)
+            found[parameter.name] = tuple(parameter.value(value) for value in numbers.tolist())
+    return found
 
 
 def _parts(points: Points, distance: Points, joined: Callable[[Points, Points], Mask]) -> NDArray[np.intp]:

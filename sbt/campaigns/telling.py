@@ -26,11 +26,11 @@ from sbt.campaigns.lost import (
 )  # fmt: skip
 from sbt.campaigns.modes import most_often, single
 from sbt.campaigns.precision import NO_BETTER, PRECISE, always_agree, more_runs, rounded, too_wide
-from sbt.campaigns.reconciling import denial, ends, nowhere_likely, reconciled
+from sbt.campaigns.reconciling import denial, ends, reconciled
 from sbt.campaigns.records import CONFIRM
-from sbt.campaigns.regions import regions_words
-from sbt.campaigns.sides import all_critical, few_of_a_side, met, none_critical, safe_runs
-from sbt.campaigns.wording import estimating, input_widths, measured, number, percent, plural, requirement_words, widening
+from sbt.campaigns.sides import all_critical, met, safe_runs
+from sbt.campaigns.whereabouts import where_critical
+from sbt.campaigns.wording import estimating, measured, number, percent, plural, requirement_words, widening
 from sbt.estimators.binomial import interval, unmet_draws
 from sbt.loop.stages import Facts
 
@@ -108,28 +108,7 @@ def tell_boundary(found: BoundaryConclusion, measured_share: CriticalShare, fact
         )
     else:
         sure = "no held-out run tested it"
-    few, widths = few_of_a_side(facts), input_widths(facts.history)
-    if found.place is not None and found.chance_place is None:
-        section = found.place.words(facts.units, widths)
-        unsharp = bool(few) or found.place.vague
-        regions = () if unsharp or found.regions is None else found.regions  # roughness would be counted
-        where = regions_words(regions, found.place.inputs, facts.units, widths) or section
-        lead = f"{_of(facts, 'In').strip() or 'Here'}, a run is critical ({_condition(facts)}) where {where}"
-        if unsharp:
-            why = few or "edges are less certain than the critical part is wide"
-            lead = (
-                f"Where runs{_of(facts)} are critical ({_condition(facts)}) is not known sharply yet: {why}. The metamodel's best"
-                f" guess is that a run is critical where {where}"
-            )
-    else:
-        lead = nowhere_likely(found, _of(facts), _condition(facts), few)
-    if found.chance_place is not None:
-        lead = found.chance_place.words(_of(facts, "In").strip() or "Here", _condition(facts), facts.units, widths)
-    if none_critical(facts):
-        lead = f"No run{_of(facts)} was critical ({_condition(facts)}), and the metamodel knows no place where one is likely"
-    elif all_critical(facts):
-        known = "the metamodel knows no place where one is likely not to be"
-        lead = f"Every run{_of(facts)} was critical ({_condition(facts)}), and {known}"
+    lead, lines = where_critical(found, facts)
     rests = f"the metamodel learned that from {plural(learned, 'run')}{f' and {found.earlier} earlier' if found.earlier else ''}"
     missing = "an uncritical" if all_critical(facts) else "a critical"
     said = [
@@ -138,8 +117,8 @@ def tell_boundary(found: BoundaryConclusion, measured_share: CriticalShare, fact
         f" region smaller than the gaps between {plural(learned, 'run')} may be missing from it.",
         f"Next: {_every_combination(facts)}{_after_boundary(found, facts, tested=tested)}.",
     ]
-    if found.place is not None and found.chance_place is None and where != section and not none_critical(facts):
-        said.append(f"On lines across the boundary, a run is critical where {section}.")
+    if lines:
+        said.append(f"On lines across the boundary, a run is critical where {lines}.")
     return [*said, *reconciled(found, measured_share, learned, recorded=facts.recorded)]
 
 
