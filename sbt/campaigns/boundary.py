@@ -12,10 +12,11 @@ from sbt.acquisitions import even, is_greedy
 from sbt.campaigns.chance import ChancePlace, chance_place
 from sbt.campaigns.choices import ChoiceRule, from_roi, greedily, mixed
 from sbt.campaigns.combinations import EveryCombination, every_combination
-from sbt.campaigns.doubt import TrafficDoubt, traffic_doubt
+from sbt.campaigns.doubt import OverTraffic, TrafficDoubt, over_traffic, traffic_doubt
 from sbt.campaigns.each import each_share, fits_words, independence_words, shares_words
 from sbt.campaigns.explained import ExplainedVariance, explained_variance
 from sbt.campaigns.exploration import largest_batch, space_filling
+from sbt.campaigns.in_doubt import pairs_in_doubt
 from sbt.campaigns.likely import CriticalCombinations, critical_combinations
 from sbt.campaigns.lost import none_gave_a_metric, nothing_known
 from sbt.campaigns.openness import by_chance, failing_range, failing_words, open_range
@@ -71,6 +72,7 @@ class BoundaryConclusion:
         fails_by_chance: nothing shows that inputs decide which runs fail; None: none fails.
         failing_range: ends of the failing fraction; None: it is not known to be a part of the space.
         critical_combinations: where no input is continuous; None: one is, or the metamodel sees none.
+        over_traffic: P(critical) is the mean over the traffic that seeds draw; None: what inputs alone tell.
         chance_place: where runs of a noisy simulator are critical most often, though not most of them are; None: most are.
     """
 
@@ -98,6 +100,7 @@ class BoundaryConclusion:
     failing_range: tuple[float, float] | None = optional()
     critical_combinations: CriticalCombinations | None = optional()
     chance_place: ChancePlace | None = optional()
+    over_traffic: OverTraffic | None = optional()
 
     def to_dict(self) -> Json:
         """Return the JSON of the command line."""
@@ -124,6 +127,8 @@ class BoundaryConclusion:
             found += self.simulator_noise.sentences(facts.requirement.told_as, facts.unit)
         if self.explained is not None:
             found.append(self.explained.sentence(facts.requirement.told_as))
+        if self.over_traffic is not None:
+            found.append(self.over_traffic.sentence())
         if self.doubt is not None:
             found.append(self.doubt.sentence())
         return found
@@ -169,11 +174,12 @@ def recipe(settings: Settings) -> Campaign:
             critical_share(log.history.where(unchosen), settings.scenario), by_chance(fitted),
             failing_range(learner, fitted, len(log.history.finished)),
             None if every is not None else critical_combinations(log_odds, settings.scenario, fitted.log_success),
-            _by_chance(log_odds, log.history, settings) if every is None else None,
+            _by_chance(log_odds, log.history, settings) if every is None else None, over_traffic(fitted, log.history),
         ), fitted  # fmt: skip
 
     most = largest_batch if settings.acquisition is None else None
-    stage = BatchStage("boundary", settings, _rule(settings), repeats=settings.acquisition is not even, most=most)
+    pairs = pairs_in_doubt if settings.acquisition is None else None
+    stage = BatchStage("boundary", settings, _rule(settings), repeats=settings.acquisition is not even, most=most, pairs=pairs)
     return Campaign((stage,), conclude)
 
 
@@ -223,7 +229,8 @@ def boundary_points(settings: Settings, history: History, most: int = 500) -> Po
     """
     if settings.learner is None or len(history.finished) < 2:
         raise InputError("boundary points need a metamodel and two finished runs, but there are none")
-    predict = settings.learner.on_inputs(settings.learner.train(history.finished), len(history.finished))
+    predictor, _ = settings.learner.over_traffic(settings.learner.train(history.finished), history)
+    predict = settings.learner.on_inputs(predictor, len(history.finished))
     space, critical = settings.scenario.space, settings.scenario.requirement.critical
     sequence = SobolSequence(space.dimension, settings.seed)
     u = sequence.admissible(lambda v: space.feasible(space.from_unit(v)), 8192, 2048)
@@ -241,4 +248,5 @@ def boundary_points(settings: Settings, history: History, most: int = 500) -> Po
 BOUNDARY = CampaignKind(
     "identify where critical meets uncritical", recipe, BoundaryConclusion, acquisition="mix", methods=("mix",),
     stop={"stable": None, "misclassified": None}, metamodel={"kind": "auto", "preset": "quick"}, takes_earlier=True,
+    over_traffic=True,
 )  # fmt: skip

@@ -4,24 +4,37 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from threadpoolctl import threadpool_limits
-
 from sbt.campaigns.settings import Settings
-from sbt.campaigns.wording import percent
-from sbt.metamodels.risk import fit_risk
-from sbt.problem.arrays import Points
-from sbt.samplers.noise import scores
-from sbt.samplers.search import fill_uniformly
-from sbt.seeds import SEED_END, stream
+from sbt.campaigns.wording import percent, plural
+from sbt.loop.drawn_traffic import DrawnTraffic
+from sbt.loop.learner import FittedMetamodel
 from sbt.store.history import VALIDATION, History
 
-__all__ = ["TrafficDoubt", "traffic_doubt"]
+__all__ = ["OverTraffic", "TrafficDoubt", "over_traffic", "traffic_doubt"]
 
 _FEWEST, _EITHER = 100, 10
 """Runs, and critical and safe ones among them, from which on shares are stated."""
-_POINTS, _SEEDS = 256, 8
-"""Points of the space, and fresh seeds at each."""
+
+
+@dataclass(frozen=True)
+class OverTraffic:
+    """That P(critical) is the mean over the traffic that seeds draw.
+
+    Attributes:
+        runs: with what was known of their traffic, from which it was learned.
+        chosen: those of them whose seeds were chosen.
+    """
+
+    runs: int
+    chosen: int
+
+    def sentence(self) -> str:
+        """Return it in words."""
+        chosen = f"; {plural(self.chosen, 'seed')} were chosen for what they draw, so that their runs count in no rate"
+        return (
+            f"P(critical) is the mean over the traffic that seeds draw, learned from {plural(self.runs, 'run')} and what was"
+            f" known of their traffic before{chosen if self.chosen else ''}."
+        )
 
 
 @dataclass(frozen=True)
@@ -51,25 +64,27 @@ class TrafficDoubt:
         )
 
 
+def over_traffic(fitted: FittedMetamodel, history: History) -> OverTraffic | None:
+    """Return from how many runs P(critical) was learned as the mean over traffic; None where inputs alone tell it."""
+    if fitted.record.over_traffic is None:
+        return None
+    runs = history.where(history.ok & (history.stage != VALIDATION))
+    return OverTraffic(len(runs), int((~runs.drawn).sum()))
+
+
 def traffic_doubt(settings: Settings, history: History) -> TrafficDoubt | None:
     """Return the shares; None where seeds are not looked at, or there are fewer than 100 runs, or 10 critical or safe ones."""
     covariates, scenario = settings.covariates, settings.scenario
-    runs = history.where((history.stage != VALIDATION) & history.drawn & (history.columns["level"] == 0))
+    runs = history.where((history.stage != VALIDATION) & (history.columns["level"] == 0))
     critical = scenario.requirement.critical_runs(runs)
     if covariates is None or len(runs) < _FEWEST or min(critical.sum(), (~critical).sum()) < _EITHER:
         return None
-    space, rng = scenario.space, stream(settings.seed, "doubt", len(runs))
-
-    def inputs(x: Points, told: Points) -> Points:
-        return np.column_stack([space.metamodel_inputs_at(x), told])
-
-    margin = np.where(runs.ok, np.nan_to_num(scenario.requirement.margins(runs), nan=np.inf, posinf=np.inf), np.inf)
-    u = fill_uniformly(lambda v: space.feasible(space.from_unit(v)), _POINTS, space.dimension, rng)
-    x, seeds = np.repeat(space.from_unit(u), _SEEDS, axis=0), rng.integers(0, SEED_END, _POINTS * _SEEDS).tolist()
-    with threadpool_limits(1):
-        risk = fit_risk(inputs(runs.x, covariates.at(runs.x, runs.seed.tolist())), scores(margin), margin, critical, rng)
-        p = np.exp(risk(inputs(x, covariates.at(x, seeds, keep=False)))[0]).reshape(_POINTS, _SEEDS)
+    drawn = DrawnTraffic(scenario, settings.seed, covariates) if settings.learner is None else settings.learner.traffic
+    learned = None if drawn is None else drawn.learned(history)
+    if drawn is None or learned is None:
+        return None
+    p = drawn.table(learned.risk)
     traffic, rest = float(p.var(axis=1, ddof=1).mean()), float((p * (1.0 - p)).mean())
-    between = max(float(p.mean(axis=1).var(ddof=1)) - traffic / _SEEDS, 0.0)
+    between = max(float(p.mean(axis=1).var(ddof=1)) - traffic / p.shape[1], 0.0)
     whole = max(between + traffic + rest, 1e-300)
-    return TrafficDoubt(float(p.mean()), between / whole, traffic / whole, rest / whole, _POINTS * _SEEDS)
+    return TrafficDoubt(float(p.mean()), between / whole, traffic / whole, rest / whole, p.size)

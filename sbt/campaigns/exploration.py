@@ -26,7 +26,10 @@ from sbt.samplers.search import DEFLATION, Search
 from sbt.seeds import stream
 from sbt.store.history import VALIDATION, History
 
-__all__ = ["about_regions", "exploration_share", "explore", "fruitless_runs", "largest_batch", "should_explore", "space_filling"]
+__all__ = [
+    "about_regions", "exploration_share", "explore", "fruitless_runs", "largest_batch", "search_of", "should_explore",
+    "space_filling",
+]  # fmt: skip
 
 _SHARE = 0.5  # of a batch that explores
 _RUNS_ABOUT, _REACH = 8, 0.15  # beside plateaus: runs an input about each known region, and their distance to its critical runs
@@ -140,8 +143,8 @@ def fruitless_runs(settings: Settings, log: Log) -> int:
     return spent
 
 
-def explore(settings: Settings, log: Log, n: int) -> Points:
-    """Return n points (n, d) in the inputs' units that search for a region apart from those that are known.
+def search_of(settings: Settings) -> Search:
+    """Return what a search for critical regions needs to know.
 
     Raises:
         ValueError: there is no metamodel.
@@ -149,13 +152,22 @@ def explore(settings: Settings, log: Log, n: int) -> Points:
     scenario, space = settings.scenario, settings.scenario.space
     if settings.learner is None:
         raise ValueError("exploration needs a metamodel")
-    if n == 0:
-        return np.empty((0, space.dimension))
-    seen = log.history.where(log.history.stage != VALIDATION)
-    search = Search(
+    return Search(
         scenario.requirement.critical, simplest(settings.learner.metamodel), space.metamodel_inputs,
         lambda u: space.feasible(space.from_unit(u)), cube=space.cube, most_rows=_MOST_ROWS, learn_success=learned_success,
     )  # fmt: skip
+
+
+def explore(settings: Settings, log: Log, n: int) -> Points:
+    """Return n points (n, d) in the inputs' units that search for a region apart from those that are known.
+
+    Raises:
+        ValueError: there is no metamodel.
+    """
+    scenario, space = settings.scenario, settings.scenario.space
+    if n == 0:
+        return np.empty((0, space.dimension))
+    seen, search = log.history.where(log.history.stage != VALIDATION), search_of(settings)
     y = scenario.requirement.values(seen)
     u = np.clip(space.to_unit(seen.x), 0.0, 1.0)
     pending = None if log.pending is None else np.clip(space.to_unit(log.pending.x), 0.0, 1.0)

@@ -88,6 +88,7 @@ class BatchStage:
         choose: the rule.
         repeats: two early runs repeat inputs with other seeds, to learn whether the simulator is noisy.
         most: gives the largest number of runs of the next batch; None: those of the settings.
+        pairs: (settings, metamodel, log, n, stage) to runs among these n whose seeds are chosen, too; None: none are.
     """
 
     name: str
@@ -95,6 +96,7 @@ class BatchStage:
     choose: ChoiceRule
     repeats: bool = False
     most: Callable[[Settings, Log], int] | None = None
+    pairs: Callable[[Settings, FittedMetamodel | None, Log, int, str], list[PlannedRun]] | None = None
 
     @property
     def ahead(self) -> int:
@@ -172,13 +174,16 @@ class BatchStage:
         held_out = 0 if self.repeats and few(s.scenario, log.planned, s.budget) else held_out
         again = () if first or not self.repeats else repeats_wanted(log.planned, s.scenario, size - held_out)
         n = size - held_out - len(again)
+        paired = [] if self.pairs is None or first or missing else self.pairs(s, fitted, log, n, self.name)
+        n -= len(paired)
         found = (evenly if first or n == 0 else filling if missing else self.choose)(s, fitted, log, n)
         stage = "initial" if first else self.name
         x = without_repetition(s.scenario, log.planned, found.x) if self.repeats else found.x
         chosen = PlannedPoints(stage, x, s.scenario.space.names, s.scenario.space.choices)
         random = held_out_runs(s, log.iteration, held_out + (s.reference if first else 0))
-        proposal = replace(found.proposal, held_out=len(random), repeats=len(again) or None)
-        return Batch((*chosen, *again, *random) if again or random else chosen, proposal, fitted)
+        proposal = replace(found.proposal, held_out=len(random), repeats=len(again) or None, pairs=len(paired) or None)
+        more = [*paired, *again, *random]
+        return Batch((*chosen, *more) if more else chosen, proposal, fitted)
 
 
 def _chose(log: Log) -> list[FitRecord]:

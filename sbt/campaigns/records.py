@@ -36,6 +36,7 @@ class BatchProposal:
         filling, representative, greedy: of a mix, runs that fill the space, represent a_BI, or were chosen one by one.
         even: of a greedy batch, runs that fill the space because nothing else was left.
         repeats: runs that repeat inputs with other seeds: the last ones of the batch before those held out.
+        pairs: runs before these whose seeds were chosen by what they draw.
     """
 
     method: str
@@ -50,6 +51,7 @@ class BatchProposal:
     greedy: int | None = optional()
     even: int | None = optional()
     repeats: int | None = optional()
+    pairs: int | None = optional()
 
 
 @dataclass(frozen=True)

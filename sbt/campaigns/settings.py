@@ -120,6 +120,7 @@ class CampaignKind:
         takes_fidelity: it takes the key `fidelity`.
         takes_earlier: its metamodel learns from the runs of an earlier campaign beside its own: it takes the key `warm_start`,
             with `transfer: true` or without.
+        over_traffic: its metamodel takes P(critical) as the mean over the traffic that seeds draw.
     """
 
     description: str
@@ -138,6 +139,7 @@ class CampaignKind:
     takes_transfer: bool = False
     takes_fidelity: bool = False
     takes_earlier: bool = False
+    over_traffic: bool = False
 
     @classmethod
     def of(cls, found: Any, name: str) -> CampaignKind:

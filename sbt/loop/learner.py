@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
+from sbt.loop.drawn_traffic import DrawnTraffic, decoded, encoded
 from sbt.loop.earlier import EarlierRuns
 from sbt.loop.several import each_requirement, independence
 from sbt.metamodels.base import Metamodel, Predictor, Screened, log_ambiguity_bound, named_errors, predicted, sketched
 from sbt.metamodels.joint import JointPrediction, JointPredictor, metamodel_for
+from sbt.metamodels.over_traffic import MeanOverTraffic, OverTrafficPredictor
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.saturation import scored
 from sbt.metamodels.scores import scores
@@ -73,6 +75,7 @@ class Learner:
         seed: of the campaign.
         target_aware: the critical edge is what is looked for, and the metamodel knows where it is; otherwise all of y counts.
         earlier: runs of an earlier campaign that it learns from, too, where they help; None: there are none.
+        traffic: that seeds draw, over which P(critical) is averaged; None: seeds are not looked at.
     """
 
     scenario: LogicalScenario
@@ -80,6 +83,7 @@ class Learner:
     seed: int
     target_aware: bool = True
     earlier: EarlierRuns | None = None
+    traffic: DrawnTraffic | None = None
 
     def fit(self, history: History) -> FittedMetamodel | None:
         """Return the metamodel fitted to these runs, and scored; None with fewer than two to learn from."""
@@ -87,15 +91,26 @@ class Learner:
         if len(training) < 2:
             return None
         predictor, taken = self._trained(training)
+        predictor, averaged = self.over_traffic(predictor, history)
         seconds = time.perf_counter() - start
         predict = self.on_inputs(predictor, len(training))
         success = self.success(history)
-        record = self._record(predict, predictor, history, len(training), success, taken)
+        record = replace(self._record(predict, predictor, history, len(training), success, taken), over_traffic=averaged)
         rough = sketched(predictor, _SKETCH)
         sketch, quick = None, None
         if rough is not predictor:
             sketch, quick = self.on_inputs(rough, len(training)), self._bound(rough)
         return FittedMetamodel(predict, record, seconds, self._bound(predictor), success, sketch, quick)
+
+    def over_traffic(self, predictor: Predictor, history: History) -> tuple[Predictor, str | None]:
+        """Return a predictor with P(critical) as the mean over traffic, and what a record keeps of it; or itself, None."""
+        traffic, requirement = self.traffic, self.scenario.requirement
+        p = None if traffic is None or requirement.combined else traffic.means(history)
+        if traffic is None or p is None:
+            return predictor, None
+        kept = encoded(p)
+        mean = MeanOverTraffic.of(self.inputs(traffic.points), decoded(kept), stream(self.seed, "over traffic"))
+        return OverTrafficPredictor(predictor, mean, requirement.critical), kept
 
     def _bound(self, predictor: Predictor) -> Callable[[Points], Vector] | None:
         """Return quick upper bounds of log a_BI at the inputs' (n, d) unit-cube points; None: the predictor has none."""

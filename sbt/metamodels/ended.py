@@ -15,6 +15,7 @@ from scipy.special import ndtr, ndtri
 
 from sbt.errors import InputError
 from sbt.metamodels.joint import JointPrediction
+from sbt.metamodels.over_traffic import OverTrafficPrediction
 from sbt.metamodels.prediction import Prediction, Scale
 from sbt.metamodels.warped_prediction import WarpedPrediction
 from sbt.problem.arrays import Points, Vector
@@ -38,6 +39,8 @@ def ended(prediction: Prediction) -> Prediction:
     """
     if isinstance(prediction, JointPrediction) and prediction.critical is not None:
         return JointPrediction.of([ended(part) for part in prediction.parts], prediction.critical)
+    if isinstance(prediction, OverTrafficPrediction):
+        return prediction.with_values(ended(prediction.values)) if prediction.values is not None else prediction
     if isinstance(prediction, EndedPrediction):
         return prediction
     scale = scale_of(prediction)

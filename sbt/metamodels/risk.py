@@ -15,7 +15,7 @@ from sbt.problem.arrays import Mask, Points, Vector
 if TYPE_CHECKING:
     from sklearn.ensemble import ExtraTreesClassifier, ExtraTreesRegressor
 
-__all__ = ["Learner", "Risk", "fit_process", "fit_risk"]
+__all__ = ["Learner", "Risk", "fit_process", "fit_risk", "fit_risk_scored"]
 
 Learner = Callable[[Points], Vector]
 """(n, m) metamodel inputs to (n,) scores, or log odds."""
@@ -53,10 +53,17 @@ def fit_risk(inputs: Points, score: Vector, margin: Vector, critical: Mask, rng:
         Geurts et al. (2006), Extremely randomized trees; Breiman (1996), Out-of-bag estimation; Wolpert (1992), Stacked
         generalization; Platt (1999).
     """
+    return fit_risk_scored(inputs, score, margin, critical, rng)[0]
+
+
+def fit_risk_scored(
+    inputs: Points, score: Vector, margin: Vector, critical: Mask, rng: np.random.Generator
+) -> tuple[Risk, Vector]:
+    """Return what `fit_risk` does, and (n,) log P of what each run was, by what had not seen it."""
     n, hits = len(score), int(critical.sum())
     base = float(np.log((hits + 0.5) / (n - hits + 0.5)))
     if n < _FEWEST or np.ptp(score) == 0.0:
-        return lambda points: _pair(np.full(len(points), base))
+        return (lambda points: _pair(np.full(len(points), base))), _log_likelihood(np.full(n, base), critical)
     placed = _placement(inputs)
     inputs, states = placed(inputs), rng.integers(2**31, size=2)
     few = min(hits, n - hits) < _EVENT
@@ -76,7 +83,7 @@ def fit_risk(inputs: Points, score: Vector, margin: Vector, critical: Mask, rng:
         at = placed(points)
         return _pair(_linear(np.column_stack([learner(at) for learner in learners]), weight))
 
-    return risk
+    return risk, _log_likelihood(_linear(unseen, weight), critical)
 
 
 def _placement(inputs: Points) -> Callable[[Points], Points]:

@@ -151,6 +151,8 @@ class FitRecord:
         requirements: of a combination, each of them; its own scores are those of the margin.
         independence: of their metrics.
         earlier: runs of an earlier campaign that it learned from, too; 0: they do not help; None: there are none.
+        over_traffic: mean P(critical) over the traffic that seeds draw, at fixed points, as hexadecimal text; None: traffic was
+            not looked at, or tells nothing.
         runs, iteration: of the campaign when it was fitted.
     """
 
@@ -168,6 +170,7 @@ class FitRecord:
     requirements: tuple[RequirementFit, ...] | None = optional()
     independence: Independence | None = optional()
     earlier: int | None = optional()
+    over_traffic: str | None = optional()
     runs: int = 0
     iteration: int = 0
 

@@ -123,7 +123,7 @@ def predict_inputs(
     training = history.finished
     if len(training) < 2:
         raise InputError(f"predict needs two runs to learn from, but {folder} has {len(training)}")
-    predictor, source = _predictor(folder, learner, training, json.dumps(choice.model_dump(mode="json"), sort_keys=True), device)
+    predictor, source = _predictor(folder, learner, history, json.dumps(choice.model_dump(mode="json"), sort_keys=True), device)
     u, predict, parts = learner.inputs(space.to_unit(x)), in_units(predictor, requirement.critical), []
     for k in range(0, len(u), _CHUNK):
         p = predicted(predict, u[k : k + _CHUNK])
@@ -243,8 +243,9 @@ def _refuse_infeasible(x: Points, space: ParameterSpace, place: Callable[[int], 
     _refuse([f"{place(row)}: inputs must satisfy '{rules}', but got {written(space.named(x[row]))}" for row in told], len(rows))
 
 
-def _predictor(folder: Path, learner: Learner, training: History, settings: str, device: str | None) -> tuple[Predictor, str]:
+def _predictor(folder: Path, learner: Learner, history: History, settings: str, device: str | None) -> tuple[Predictor, str]:
     """Return the fitted metamodel, from the file beside the store where that has learned from the same runs."""
+    training = history.finished
     path, key = folder / MODEL, _key(learner, training, settings)
     if device is not None:
         from sbt.metamodels.torch_tools import device_of
@@ -256,7 +257,7 @@ def _predictor(folder: Path, learner: Learner, training: History, settings: str,
                 return load(path, device), "loaded"
         except InputError:  # damaged or of another version: it is only a copy, and is made again
             pass
-    predictor = learner.train(training)
+    predictor, _ = learner.over_traffic(learner.train(training), history)
     info: Json = {
         "key": key, "inputs": list(training.names), "metric": learner.scenario.requirement.metric, "runs": len(training),
     }  # fmt: skip
@@ -270,8 +271,8 @@ def _predictor(folder: Path, learner: Learner, training: History, settings: str,
 def _key(learner: Learner, training: History, settings: str) -> str:
     """Return a key of all that decides a fit: the rows, the settings, the seed, the space, the version."""
     space, critical = learner.scenario.space, learner.scenario.requirement.critical
-    features = [name for name, _ in space.features]
-    decisive = (settings, learner.seed, repr(critical), repr(space.parameters), features, version("sumo-sbt"))
+    features, kept = [name for name, _ in space.features], None if learner.traffic is None else learner.traffic.kept
+    decisive = (settings, learner.seed, repr(critical), repr(space.parameters), features, version("sumo-sbt"), kept)
     digest = hashlib.blake2b(json.dumps([str(part) for part in decisive]).encode(), digest_size=16)
     digest.update(np.ascontiguousarray(training.x).tobytes())
     digest.update(np.ascontiguousarray(learner.inputs(space.to_unit(training.x))).tobytes())  # features, too

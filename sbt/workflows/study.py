@@ -18,6 +18,7 @@ from sbt.execution.dask import DaskExecutor
 from sbt.execution.local import LocalExecutor
 from sbt.execution.protocol import Executor, SerialExecutor
 from sbt.execution.spec import ScenarioSpec
+from sbt.loop.drawn_traffic import OVER_TRAFFIC, DrawnTraffic
 from sbt.loop.earlier import EarlierRuns
 from sbt.loop.learner import FittedMetamodel, Learner
 from sbt.loop.running import ahead_of
@@ -104,7 +105,8 @@ class Study:
             if "kind" in kept:
                 given["campaigns", name] = CampaignKind.absent(name, kept["kind"])
         loaded = parse(text, name=str(store.folder / RESOLVED), folder=folder, objects=given, store=store.folder)
-        return cls(loaded, kept, live, store.folder)
+        fits = store.fits() if COVARIATES in kept and not live else []
+        return cls(loaded, {**kept, OVER_TRAFFIC: fits[-1].over_traffic} if fits else kept, live, store.folder)
 
     def stored_in(self, store: Store) -> Study:
         """Return the study with the defaults that its store was begun with."""
@@ -252,7 +254,8 @@ class Study:
         metamodel = self._assembly.metamodel if self.live else metamodel_of(self.loaded)
         if metamodel is None or config.acquisition.kind in self.kind.metamodel_free:
             return None
-        learner = Learner(self.scenario, metamodel, config.seed, self.kind.target_aware)
+        traffic = DrawnTraffic.of(self.scenario, config.seed, self.covariates, self.kept) if self.kind.over_traffic else None
+        learner = Learner(self.scenario, metamodel, config.seed, self.kind.target_aware, traffic=traffic)
         if config.warm_start is None or not self.kind.takes_earlier:
             return learner
         kept = self.kept.get(EARLIER)

@@ -1,0 +1,136 @@
+"""P(critical | inputs) over the traffic that seeds draw: learned from pairs, kept in the store, right where it is known."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.special import ndtr
+
+import sbt
+from sbt.loop.drawn_traffic import decoded, encoded
+from sbt.metamodels.over_traffic import OverTrafficPrediction
+from sbt.metamodels.prediction import Prediction
+from sbt.problem.requirement import CriticalInterval
+from sbt.store.database import Store
+from sbt.workflows.study import Study
+
+X = np.linspace(-0.98, 0.98, 50)
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """y = 1 + x + w + .3 e <= 0 is critical: w drawn by the seed and told (or another number is), e noise."""
+
+    told: bool = True
+
+    def __call__(self, values: dict[str, float], seed: int) -> dict[str, float]:
+        w, e = np.random.default_rng(seed).standard_normal(2)
+        return {"y": float(1.0 + values["x"] + w + 0.3 * e)}
+
+    def known_before(self, values: dict[str, float], seed: int) -> dict[str, float]:
+        rng = np.random.default_rng(seed if self.told else (seed, 1))
+        return {"w": float(rng.standard_normal())}
+
+
+RATE = ndtr((-1.0 - X) / math.hypot(1.0, 0.3))
+
+
+def run(folder: Path, **keys: object) -> sbt.Result:
+    inputs = [sbt.Parameter("x", -1, 1), sbt.Parameter("idle", 0, 1)]
+    given = {
+        "campaign": "boundary", "seed": 2, "budget": 100, "executor": "serial", "report": False, "metamodel": "gp",
+        "store": folder,
+        "scenario": sbt.Scenario("drawn", inputs, sbt.Requirement("y", high=0.0), evaluate=keys.pop("evaluate", Drawn())),
+    }  # fmt: skip
+    return sbt.run(**{**given, **keys})
+
+
+def error(result: sbt.Result) -> float:
+    found = np.asarray(result.predict({"x": X, "idle": 0.5})["p_critical"])
+    return float(np.sqrt(np.mean((found - RATE) ** 2)) / RATE.std())
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory) -> sbt.Result:
+    return run(tmp_path_factory.mktemp("over_traffic") / "store")
+
+
+def test_p_over_traffic_is_nearer_the_truth_than_that_of_inputs_alone(result: sbt.Result) -> None:
+    assert error(result) < 0.35
+    assert result.conclusion.critical_fraction == pytest.approx(RATE.mean(), rel=0.3)
+
+
+def test_half_of_what_is_chosen_has_chosen_seeds_and_nothing_else_has(result: sbt.Result) -> None:
+    frame = result.frame
+    later = frame[(frame.iteration > 0) & (frame.stage == "boundary")]
+    assert 0.25 < later.seed_chosen.mean() <= 0.5
+    assert not frame[frame.stage != "boundary"].seed_chosen.any(), "held-out runs, repeats and the first batch have drawn seeds"
+    assert frame[frame.seed_chosen].seed.is_unique
+    chosen, drawn = (later[later.seed_chosen == which] for which in (True, False))
+    assert chosen.critical.mean() > drawn.critical.mean(), "pairs in doubt are critical more often than drawn ones"
+    assert not result.history.training.columns["seed_chosen"].any()
+
+
+def test_a_store_tells_the_same_p_without_the_code_of_its_scenario(result: sbt.Result) -> None:
+    with Store.read(result.store) as store:
+        study, fit, history = Study.from_store(store), store.fits()[-1], store.history()
+    assert study.covariates is None
+    assert study.learner is not None
+    assert study.learner.traffic is not None
+    traffic = study.learner.traffic
+    p = traffic.means(history)
+    assert encoded(p) == fit.over_traffic
+    fitted = study.fit(history)
+    assert fitted.record.critical_fraction == pytest.approx(fit.critical_fraction, abs=1e-9)
+    assert fitted.record.sides == fit.sides
+    at = fitted.predict(traffic.points).probability(study.scenario.requirement.critical)
+    assert np.corrcoef(at, p)[0, 1] > 0.85
+    assert p.min() - 1e-9 <= at.min() <= at.max() <= p.max() + 1e-9
+
+
+def test_a_campaign_that_stopped_and_went_on_in_other_processes_has_the_same_pairs(tmp_path: Path) -> None:
+    more = {"initial": 15, "batch": 15}
+    whole = run(tmp_path / "whole", budget=75, **more).frame
+    run(tmp_path / "parts", budget=45, **more)
+    parts = run(tmp_path / "parts", budget=75, executor={"kind": "local", "workers": 2}, **more).frame
+    columns = ["x.x", "x.idle", "seed", "y.y", "seed_chosen"]
+    assert whole.seed_chosen.any()
+    assert whole[columns].equals(parts[columns])
+
+
+def test_traffic_that_tells_nothing_is_not_looked_at(tmp_path: Path) -> None:
+    found = run(tmp_path / "useless", evaluate=Drawn(told=False))
+    assert [fit.over_traffic for fit in found.fits[-4:]] == [None] * 4
+    assert not found.frame[found.frame.iteration == found.frame.iteration.max()].seed_chosen.any()
+
+
+def test_without_covariates_nothing_of_it_is_there(tmp_path: Path) -> None:
+    off = run(tmp_path / "off", budget=60, covariates=False)
+    assert not off.frame.seed_chosen.any()
+    assert {fit.over_traffic for fit in off.fits} == {None}
+
+
+def test_a_prediction_over_traffic_has_its_own_p_and_all_else_of_its_values() -> None:
+    critical, p = CriticalInterval(high=0.0), np.array([0.1, 0.5, 1e-6])
+    values = Prediction.gaussian(np.array([1.0, 2.0, 3.0]), np.ones(3))
+    found = OverTrafficPrediction.of(values, critical, p)
+    assert found.probability(critical) == pytest.approx(p)
+    log_p, log_not = found.log_probability(critical)
+    assert np.exp(log_p) + np.exp(log_not) == pytest.approx(np.ones(3))
+    other = CriticalInterval(high=1.0)
+    assert found.probability(other) == pytest.approx(values.probability(other))
+    assert found.mu == pytest.approx(values.mu)
+    assert found.quantile(0.9) == pytest.approx(values.quantile(0.9))
+    parts = found.take(slice(0, 1)), found.take(np.array([1, 2]))
+    whole = parts[0].joined(parts[1:])
+    assert whole.probability(critical) == pytest.approx(p)
+    assert whole.log_density(np.zeros(3)) == pytest.approx(values.log_density(np.zeros(3)))
+
+
+def test_rates_survive_being_written() -> None:
+    p = np.concatenate([[0.0, 1.0], np.geomspace(1e-6, 1.0, 50)])
+    assert decoded(encoded(p)) == pytest.approx(p, rel=0.02, abs=1e-8)
