@@ -46,6 +46,8 @@ class _Simulation(Protocol):
     def timeout(self) -> float | None: ...
     @property
     def batched(self) -> bool: ...
+    @property
+    def one_level(self) -> bool: ...
 
     def __call__(self, values: Values, seed: int) -> Trace: ...
     def build_scene(self, values: Values, seed: int) -> Scene: ...
@@ -91,7 +93,12 @@ def _simulate_in_replicas(
     results: dict[int, Trace | BaseException],
     at_work: Report,
 ) -> None:
-    """Add to `results` the traces of the runs that can share a simulation."""
+    """Add to `results` the traces of the runs that can share a simulation: none where roads are on different levels.
+
+    Which roads pass over each other cannot be seen where copies of the network lie on it.
+    """
+    if not simulation.one_level:
+        return
     scenes: dict[int, Scene] = {}
     for index, (values, seed) in enumerate(work):
         at_work((index,))
@@ -138,7 +145,7 @@ def _step_until_done(
 def _start(sumo: Any, simulation: _Simulation, prefix: str, index: int, scene: Scene) -> _ReplicaRun:
     """Insert the actors of a run into a replica."""
     insert(sumo, scene, prefix)
-    run = SumoRun(sumo, scene, simulation.step_length, simulation.duration, prefix)
+    run = SumoRun(sumo, scene, simulation.step_length, simulation.duration, prefix, one_level=True)
     return _ReplicaRun(prefix, index, scene, time.monotonic(), run, run.advance)
 
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import copy
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from typing import Any
 
+from sbt.metrics.heights import LEVEL_HEIGHT
 from sbt.problem.outcome import OTHER_LEVEL
 from sbt.sumo.actors import State
-from sbt.sumo.levels import Ground, Trails, is_known, levels_of, road_of
+from sbt.sumo.ground import Ground, Place, Trails
+from sbt.sumo.levels import is_known, levels_of, road_of
 from sbt.sumo.off_lanes import POSITION, VEHICLE
 from sbt.sumo.overlaps import deepest_overlap, instant, state_in_sumo
 
@@ -16,8 +19,6 @@ __all__ = ["EgoLevel"]
 
 _LONGEST = 30.0
 """Length up to which others on another level are compared with the ego (m)."""
-
-_Place = tuple[float, ...]
 
 
 class EgoLevel:
@@ -33,7 +34,7 @@ class EgoLevel:
     def __init__(self, sumo: Any):
         self._sumo = sumo
         self._levels, self.trails = levels_of(sumo), Trails(sumo)
-        self._several = bool(self._levels.apart) or self._levels.stacked
+        self._several = self._levels.several
         self._last: dict[str, tuple[str, float]] = {}
         self._notes: dict[tuple[str, str], str] = {}
         self._off: Collection[str] = ()
@@ -46,23 +47,43 @@ class EgoLevel:
         """Contacts in the plane that are none, as roads of a network without heights are taken for bridges."""
         return tuple(self._notes.values())
 
+    def of_another(self) -> EgoLevel:
+        """Return the level of another road user, which knows the trails and last roads that this one does."""
+        other = copy.copy(self)
+        other._notes = {}
+        return other
+
+    def begin(self, name: str, road: str, z: float) -> None:
+        """Take a road to be the last one of somebody who begins off the lanes, and its height there (m)."""
+        self._last[name] = road, z
+
     def keep(self, name: str) -> None:
         """Remember the road and the height of a vehicle that is about to be moved, if it is on a lane."""
         if self._several and is_known(self._sumo, name):
             self._keep(name, self._sumo.vehicle.getPosition3D(name), person=False)
 
-    def _keep(self, name: str, at: Sequence[float], *, person: bool) -> str:
+    def stays(self, name: str) -> bool:
+        """Remember the road of a vehicle that is moved by poses; return whether SUMO has it on one of its level.
+
+        SUMO puts who is moved onto the nearest lane in the plane, whatever its height.
+        """
+        at = self._sumo.vehicle.getPosition3D(name)
+        if abs(at[2] - self._last[name][1]) >= LEVEL_HEIGHT:
+            return False
+        return self._keep(name, at, person=False) != ""
+
+    def _keep(self, name: str, at: Place, *, person: bool) -> str:
         road = road_of(self._sumo, name, person=person)
         if road:
             self._last[name] = road, at[2]
         return road
 
-    def _at_last(self, name: str, at: Sequence[float]) -> tuple[_Place, str]:
+    def _at_last(self, name: str, at: Place) -> tuple[Place, str]:
         """Return a place (x, y, z) with the height of the last road, and that road; "" where it is not known."""
         road, z = self._last.get(name, ("", at[2]))
         return (at[0], at[1], z), road
 
-    def enter(self, ego: State, at: Sequence[float], off: Collection[str], t: float, *, person: bool) -> None:
+    def enter(self, ego: State, at: Place, off: Collection[str], t: float, *, person: bool) -> None:
         """Take the ego to be at (x, y, z) in the step at t (s) of the trace; off: who is on no lane."""
         if not self._several:
             return
@@ -83,7 +104,7 @@ class EgoLevel:
         if self._ground is None and self._apart is None:
             return False
         person, off = VEHICLE in variables, name in self._off
-        place: Sequence[float]
+        place: Place
         if off:
             place, road = self._at_last(name, variables[POSITION])
         elif long:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import heapq
 import math
 import re
-from collections import defaultdict, deque
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -19,18 +19,10 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Ground", "Levels", "Trails", "is_known", "levels_of", "road_of"]
+from sbt.metrics.heights import LEVEL_HEIGHT, STACKED
 
-_LEVEL_HEIGHT = 3.0
-"""Difference in height from which on two road users are on different levels, such as on and under a bridge (m)."""
-_STEEPEST = 0.15
-"""Slope of no road: who is so much higher is above, also on a road that the ego's way leads to."""
-_DETOUR = 1.5
-"""Largest ratio of the way to the beeline between road users on one level by their way: a ramp leads around, and above itself."""
-_MOVED = 1.0
-"""Distance between places that a trail keeps (m)."""
-_STACKED = 15.0
-"""Distance of places on roads within which they are one above the other, or not (m): places are at most 20 m apart on each."""
+__all__ = ["Levels", "is_known", "levels_of", "road_of"]
+
 _RAMP = 60.0
 """A way between two roads that is not longer does not lead to another level (m): 3 m in 60 m are a slope of 5 %."""
 _APPROACH = 150.0
@@ -60,6 +52,11 @@ class Levels:
     stacked: bool = False
 
     @property
+    def several(self) -> bool:
+        """Whether road users may be on different levels."""
+        return bool(self.apart) or self.stacked
+
+    @property
     def warning(self) -> str:
         """What the user is told; "" where there is nothing."""
         said = []
@@ -71,7 +68,7 @@ class Levels:
             )
         if self.level:
             said.append(
-                f"edges cross without a junction at heights that differ by less than {_LEVEL_HEIGHT:g} m"
+                f"edges cross without a junction at heights that differ by less than {LEVEL_HEIGHT:g} m"
                 f" ({_named(self.level)}): they are taken to meet there, although in SUMO nobody sees the other; give bridges"
                 " their height (z), or make a junction"
             )
@@ -93,48 +90,6 @@ def levels_of(sumo: Any) -> Levels:
     return _cached(file.resolve(), state.st_mtime_ns, state.st_size, _Client(sumo))
 
 
-@dataclass(frozen=True)
-class Ground:
-    """Where the ego is in a step, and how the road rises there.
-
-    Attributes:
-        sumo: SUMO's client.
-        domain: its vehicles or persons, whichever the ego is.
-        ego, place: its name and position (x, y, z).
-        rise: of the road in both directions of the plane (m/m).
-        off: it is on no lane.
-    """
-
-    sumo: Any
-    domain: Any
-    ego: str
-    place: Sequence[float]
-    rise: tuple[float, float]
-    off: bool = False
-
-    @classmethod
-    def under(cls, sumo: Any, domain: Any, ego: str, place: Sequence[float], *, off: bool = False) -> Ground:
-        """Return the ground under the ego; flat where it is on no lane."""
-        return cls(sumo, domain, ego, place, (0.0, 0.0) if off else _rise(domain, ego), off)
-
-    def is_below(self, name: str, other: Sequence[float], *, person: bool, off: bool = False) -> bool:
-        """Return whether a road user at (x, y, z), off: on no lane, is so much higher, or lower, that it is on another level.
-
-        Roads rise: who is far is on the same level if it is as high as the slope of its road or of the ego's leads, or between,
-        or on the way of one to the other.
-        """
-        dx, dy, height = (there - here for there, here in zip(other, self.place, strict=True))
-        theirs = (0.0, 0.0) if off else _rise(self.sumo.person if person else self.sumo.vehicle, name)
-        rises = [dx * x + dy * y for x, y in (self.rise, theirs)]
-        if min(rises) - _LEVEL_HEIGHT < height < max(rises) + _LEVEL_HEIGHT:
-            return False
-        vehicle, far = self.sumo.vehicle, math.hypot(dx, dy)
-        if abs(height) > _STEEPEST * far or person or off or self.off or self.domain is not vehicle:
-            return True
-        ways = ((self.ego, name), (name, self.ego))
-        return not any(0.0 <= _way(self.sumo, a, b) <= _DETOUR * far for a, b in ways)
-
-
 def is_known(sumo: Any, vehicle: str) -> bool:
     """Return whether a vehicle is in the simulation: SUMO does not list as arrived whom a loop has removed."""
     try:
@@ -142,48 +97,6 @@ def is_known(sumo: Any, vehicle: str) -> bool:
     except sumo.TraCIException:
         return False
     return True
-
-
-class Trails:
-    """Where the fronts of very long vehicles have been, as far as their bodies are there now."""
-
-    def __init__(self, sumo: Any):
-        self._sumo, self._passed = sumo, dict[str, deque[tuple[float, Sequence[float], str]]]()
-
-    def note(self, name: str, length: float) -> bool:
-        """Note where a vehicle of a length (m) is; return whether SUMO knows it."""
-        if not is_known(self._sumo, name):
-            self._passed.pop(name, None)
-            return False
-        place, trail = self._sumo.vehicle.getPosition3D(name), self._passed.setdefault(name, deque())
-        along, moved = (trail[-1][0], math.dist(trail[-1][1][:2], place[:2])) if trail else (0.0, math.inf)
-        if moved >= _MOVED:
-            trail.append((along + min(moved, length), place, road_of(self._sumo, name)))
-        while len(trail) > 1 and trail[-1][0] - trail[1][0] > length:
-            trail.popleft()
-        return True
-
-    def nearest(self, name: str, own: Sequence[float]) -> tuple[Sequence[float], str]:
-        """Return the place (x, y, z) that its body covers next to the ego's, and the road there."""
-        return min(self._passed[name], key=lambda passed: math.dist(passed[1][:2], own[:2]))[1:]
-
-
-def _rise(domain: Any, name: str) -> tuple[float, float]:
-    """Return by how much the road under somebody rises in both directions of the plane (m/m)."""
-    angle, slope = math.radians(domain.getAngle(name)), math.tan(math.radians(domain.getSlope(name)))
-    return slope * math.sin(angle), slope * math.cos(angle)
-
-
-def _way(sumo: Any, name: str, to: str) -> float:
-    """Return how far a vehicle's route leads to another one (m); negative where it does not."""
-    road = road_of(sumo, to)
-    if not road:
-        return -1.0
-    try:
-        at = road, sumo.vehicle.getLanePosition(to), sumo.vehicle.getLaneIndex(to)
-        return float(sumo.vehicle.getDrivingDistance(name, *at))
-    except sumo.TraCIException:  # a lane that is not on its way
-        return -1.0
 
 
 def road_of(sumo: Any, name: str, *, person: bool = False) -> str:
@@ -246,7 +159,7 @@ def _find(sumo: Any) -> Levels:
         flat = abs(height) < _FLAT
         if network.connected(a, at_i, b, at_j):
             continue
-        if not flat and abs(height) < _LEVEL_HEIGHT:
+        if not flat and abs(height) < LEVEL_HEIGHT:
             level.append((a.edge, b.edge, x, y))
             continue
         if flat:
@@ -268,8 +181,8 @@ def _stacked(sumo: Any, roads: list[_Road]) -> bool:
     at = place + np.hypot(*(end - start).T)
     points = np.concatenate([start, end])
     heights = np.array([_height(sumo, roads[k], x) for k, x in zip((*owner, *owner), (*place, *at), strict=True)])
-    pairs = cKDTree(points).query_pairs(_STACKED, output_type="ndarray")
-    return bool((np.abs(heights[pairs[:, 0]] - heights[pairs[:, 1]]) >= _LEVEL_HEIGHT).any())
+    pairs = cKDTree(points).query_pairs(STACKED, output_type="ndarray")
+    return bool((np.abs(heights[pairs[:, 0]] - heights[pairs[:, 1]]) >= LEVEL_HEIGHT).any())
 
 
 def _height(sumo: Any, road: _Road, at: float) -> float:

@@ -10,11 +10,11 @@ from sbt.sumo.levels import is_known
 from sbt.sumo.off_lanes import ANGLE, POSITION, SPEED, VEHICLE
 from sbt.sumo.trailing import LONGEST_RIGID
 
-__all__ = ["Nearby"]
+__all__ = ["VERY_LONG", "Nearby"]
 
 _VEHICLES, _PERSONS = 0xA4, 0xAE
 """TraCI domains: CMD_GET_VEHICLE_VARIABLE, CMD_GET_PERSON_VARIABLE."""
-_VERY_LONG = 20.0
+VERY_LONG = 20.0
 """Length from which on every vehicle is followed one by one, as no subscription reaches to its front (m)."""
 _WIDTHS = 3.0
 """Half the widths of two road users, at most (m)."""
@@ -54,7 +54,7 @@ class Nearby:
 
     def depart(self, name: str, length: float) -> None:
         """Note a vehicle of this length (m)."""
-        if length > (self._longest if self._subscribed else _VERY_LONG):
+        if length > (self._longest if self._subscribed else VERY_LONG):
             self.very_long[name] = length
         else:
             self._longest = max(self._longest, length)

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from sbt.sumo.batch import simulate_many
 from sbt.sumo.ego import Ego
 from sbt.sumo.formatting import plain_values
 from sbt.sumo.insertion import insert, type_name, verify
+from sbt.sumo.levels import Levels, levels_of
 from sbt.sumo.models import SUBLANE
 from sbt.sumo.nets import net_file
 from sbt.sumo.session import Setup, check_options, session, unwrapped
@@ -190,6 +192,18 @@ class SumoSimulation:
         """Whether several runs share one simulation."""
         return self.isolation_level == "replicas"
 
+    @property
+    def one_level(self) -> bool:
+        """Whether no road of the network is on another level than another one, such as a bridge."""
+        return not _levels(str(net_file(self.net))).several
+
+    def warnings(self) -> tuple[str, ...]:
+        """Return what is to be known of the network, such as that roads are taken for bridges; none where it cannot be loaded."""
+        try:
+            return tuple(filter(None, [_levels(str(net_file(self.net))).warning]))
+        except RunError:
+            return ()
+
     def build_scene(self, values: Values, seed: int) -> Scene:
         """Return the scene of one concrete scenario, with new controllers."""
         values = plain_values(values)
@@ -216,3 +230,10 @@ class SumoSimulation:
         """Return what SUMO is loaded from for a scene."""
         types = tuple(sorted({type_name(a): a.type for a in scene.actors}.items()))
         return Setup(str(net_file(self.net)), types, self.step_length, self.lane_change_duration, self.options, replicas)
+
+
+@cache
+def _levels(net: str) -> Levels:
+    """Return the levels of a network file; SUMO loads it alone, once per process."""
+    with session().run(Setup(net, (), 1.0), 0, "fresh") as sumo:
+        return levels_of(sumo)

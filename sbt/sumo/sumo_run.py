@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 import numpy as np
@@ -13,19 +13,21 @@ from sbt.errors import RunError
 from sbt.metrics.geometry import contact_part
 from sbt.problem.outcome import Status
 from sbt.problem.trace import ActorTrace, Trace
-from sbt.sumo.actors import KEEP, Action, Actor, Obstacle, Scene, State, view_of
+from sbt.sumo.actors import KEEP, Action, Actor, Controller, Obstacle, Scene, State, view_of
 from sbt.sumo.appearances import refuse_overlap_at_start
 from sbt.sumo.contacts import CONFIRMED_WITHIN, collisions_of, unconfirmed_contact
 from sbt.sumo.dead_ends import refuse_dead_ends
 from sbt.sumo.dynamics import MAX_SPEED, next_speed
 from sbt.sumo.insertion import LANE_REQUEST_DURATION, pose_setter
 from sbt.sumo.reading import ROW, Onlooker, observer, table
+from sbt.sumo.scene_levels import SceneLevels
 from sbt.sumo.session import is_ballistic, unwrapped
 
 __all__ = ["SumoRun"]
 
 _SLACK = 1e-6
 """Below this distance (m) of two rectangles the quick separation tests do not decide, but the exact one."""
+_Act = Callable[[float, State, tuple[State, ...]], Action]
 _START_REMEDY = "change where the actors start, or keep the inputs apart by constraints"
 
 
@@ -38,6 +40,7 @@ class SumoRun:
         dt: SUMO's step (s).
         duration: longest simulated time (s).
         prefix: of the names of the actors in SUMO.
+        one_level: whether no road of the network is on another level than another one; None: to be found out.
 
     Attributes:
         advance: to be called after every step of SUMO: records the states and calls the controllers; returns
@@ -45,7 +48,7 @@ class SumoRun:
         recorded: returns the number of recorded instants.
     """
 
-    def __init__(self, sumo: Any, scene: Scene, dt: float, duration: float, prefix: str = ""):
+    def __init__(self, sumo: Any, scene: Scene, dt: float, duration: float, prefix: str = "", *, one_level: bool | None = None):
         self._scene, self._dt = scene, float(dt)
         self._last = round(duration / self._dt)
         self._rows = bytearray((self._last + 1) * len(scene.actors) * ROW.size)
@@ -56,6 +59,7 @@ class SumoRun:
         self._onlooker: Onlooker | None = None
         self._ended = ""
         self._sumo, self._prefix = sumo, prefix
+        self._levels = None if one_level else SceneLevels.of(sumo, scene.actors)
         self.advance, self.recorded = self._functions(sumo, prefix)
 
     def _functions(self, sumo: Any, prefix: str) -> tuple[Callable[[], bool], Callable[[], int]]:
@@ -65,7 +69,8 @@ class SumoRun:
         for actor, state in zip(scene.actors, states, strict=True):
             state.steered = None if actor.pose is None else float(actor.speed)
         until, probes = scene.until, tuple(scene.signals.values())
-        control = _control(sumo, scene.actors, states, dt, prefix)
+        levels = self._levels
+        control = _control(sumo, scene.actors, states, dt, prefix, levels)
         touching = _contact_test(states, rows, dt)
         solid = [k for k, a in enumerate(scene.actors) if not a.person][1:]
         by_name: Mapping[str, State]
@@ -82,12 +87,16 @@ class SumoRun:
             k += 1
             t = k * dt
             observe(k)
+            if levels is not None:
+                levels.look(t, by_name)
             if k == 0:
                 for state in states:
                     by_name[state.name]
                 standing = [_standing(obstacle) for obstacle in scene.obstacles if obstacle.solid]
-                refuse_overlap_at_start(states[0], (*states[1:], *standing), _START_REMEDY)
-            touched = touching(k, solid if look is None else look.near(k))
+                others = range(1, len(states)) if levels is None else levels.on_its(0, range(1, len(states)))
+                refuse_overlap_at_start(states[0], (*[states[j] for j in others], *standing), _START_REMEDY)
+            near = solid if look is None else look.near(k)
+            touched = touching(k, near) if levels is None else touching(k, levels.on_its(0, near), levels.arrived())
             if touched is not None:
                 self._judge(sumo, prefix, t, touched)
             ended = "collision" if touched is not None else until(t, by_name) if until is not None else None
@@ -136,8 +145,11 @@ class SumoRun:
             states = np.concatenate([states, np.broadcast_to(standing, (len(states), *standing.shape))], axis=1)
             sizes += [(o.length, o.width) for o in scene.obstacles]
             names += [o.name for o in scene.obstacles]
+        refuse_dead_ends(self._sumo, actors, states[:, : len(actors), 3], self._dt, self._prefix)
+        if self._levels is not None:
+            for k, hidden in enumerate(self._levels.hidden):
+                states[k, list(hidden)] = np.nan
         x, y, heading, speed, acceleration = np.moveaxis(states, 2, 0)
-        refuse_dead_ends(self._sumo, actors, speed[:, : len(actors)], self._dt, self._prefix)
         return Trace(
             np.arange(len(states), dtype=np.float64) * self._dt,
             tuple(names),
@@ -151,7 +163,7 @@ class SumoRun:
             self._ended,
             tuple(self._collisions),
             {name: np.array([row[k] for row in self._signals]) for k, name in enumerate(scene.signals)},
-            unconfirmed=self._unconfirmed,
+            unconfirmed=(*self._unconfirmed, *(() if self._levels is None else self._levels.notes)),
             ballistic=is_ballistic(self._sumo),
             flat=tuple(o.name for o in scene.obstacles if not o.solid),
             view=view_of(actors[0].driver, float(actors[0].type.length), float(actors[0].type.width)),
@@ -166,13 +178,15 @@ def _standing(obstacle: Obstacle) -> State:
     return state
 
 
-def _control(sumo: Any, actors: tuple[Actor, ...], states: list[State], dt: float, prefix: str) -> Callable[[float], None]:
-    """Return the function that calls every controller and passes its action on to SUMO."""
+def _control(
+    sumo: Any, actors: tuple[Actor, ...], states: list[State], dt: float, prefix: str, levels: SceneLevels | None
+) -> Callable[[float], None]:
+    """Return the function that calls every controller, with those on its level, and passes its action on to SUMO."""
     set_speed = unwrapped(sumo, "vehicle", "setSpeed")
     pose_setters = {prefix + a.name: pose_setter(sumo, a, prefix) for a in actors}
     driven = [
-        (a, s, a.driver.act, tuple(o for o in states if o is not s), prefix + a.name)
-        for a, s in zip(actors, states, strict=True)
+        (a, s, _acting(a.driver, k, states, levels), tuple(o for o in states if o is not s), prefix + a.name)
+        for k, (a, s) in enumerate(zip(actors, states, strict=True))
         if a.driver is not None
     ]
 
@@ -203,6 +217,13 @@ def _control(sumo: Any, actors: tuple[Actor, ...], states: list[State], dt: floa
     return control
 
 
+def _acting(driver: Controller, k: int, states: list[State], levels: SceneLevels | None) -> _Act:
+    """Return what the controller of actor k does, which sees nobody on another level."""
+    if levels is None:
+        return driver.act
+    return lambda t, own, others: driver.act(t, own, tuple(states[j] for j in levels.on_its(k, range(len(states))) if j != k))
+
+
 def _change_lane(sumo: Any, actor: Actor, name: str, lane: int) -> None:
     """Start a lane change; SUMO would silently ignore a lane that the edge does not have."""
     edge = sumo.vehicle.getRoadID(name)
@@ -219,17 +240,18 @@ _Touch = tuple[str, ActorTrace, ActorTrace]
 """Who touched the ego, and the rectangles that touch: the ego's and the other's."""
 
 
-def _contact_test(states: list[State], rows: bytearray, dt: float) -> Callable[[int, list[int]], _Touch | None]:
+def _contact_test(states: list[State], rows: bytearray, dt: float) -> Callable[..., _Touch | None]:
     """Return the function that tells which of some rectangles the first actor, the ego, touched in the step to row k, or None.
 
-    The exact test is left to pairs that are neither far apart nor separated by an axis of the ego's rectangle.
+    It takes k, the numbers of the others, and of those who were on another level in row k - 1, whose step is not looked at. The
+    exact test is left to pairs that are neither far apart nor separated by an axis of the ego's rectangle.
     """
     ego, near = states[0], 2.0 * max(s.length for s in states)
     width, place = ROW.size * len(states), struct.Struct("=2d").unpack_from
     columns = [(s, j, ROW.size * j) for j, s in enumerate(states)]
     length, breadth = 0.5 * ego.length + _SLACK, 0.5 * ego.width + _SLACK
 
-    def touching(k: int, others: list[int]) -> _Touch | None:
+    def touching(k: int, others: list[int], arrived: Collection[int] = ()) -> _Touch | None:
         x, y, speed = ego.x, ego.y, ego.speed
         for other, j, column in [columns[j] for j in others]:
             dx, dy, reach = other.x - x, other.y - y, near + (speed + other.speed) * dt
@@ -245,7 +267,7 @@ def _contact_test(states: list[State], rows: bytearray, dt: float) -> Callable[[
                 left, left_0 = dy * cos - dx * sin, dy_0 * cos - dx_0 * sin
                 if (left > across and left_0 > across) or (left < -across and left_0 < -across):
                     continue
-                step = table(rows, max(k - 1, 0), k + 1, len(states))
+                step = table(rows, k if j in arrived else max(k - 1, 0), k + 1, len(states))
                 found = contact_part(_track(step, 0, ego), _track(step, j, other))
                 if found is not None:
                     return other.name, found[1], found[2]
