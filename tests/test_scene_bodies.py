@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +13,14 @@ import pytest
 from test_evidence import SOUTH_NORTH, WEST_EAST, net
 
 from sbt.metrics.fcd import catalogue
+from sbt.metrics.geometry import contact_index
 from sbt.sumo.actors import KEEP, Action, Actor, Scene, State, VehicleType
 from sbt.sumo.simulation import SumoSimulation
 
+BUS = VehicleType(14.0, 2.5, (("maxSpeed", "8"),))
+ARC = [(22.0 * math.sin(a), -22.0 * math.cos(a)) for a in np.linspace(0.0, math.pi, 60)]
+BEND = [(x, -22.0) for x in np.linspace(-60.0, -1.0, 20)] + ARC + [(x, 22.0) for x in np.linspace(-1.0, -60.0, 20)]
+"""To the left, so that the second lane is inside."""
 pytestmark = pytest.mark.sumo
 
 CAR = VehicleType(attributes=(("maxSpeed", "10"),))
@@ -99,3 +106,59 @@ def test_who_begins_by_a_pose_is_on_the_level_of_its_lane(tmp_path: Path) -> Non
 
     for z, ended in ((6.0, "duration"), (0.5, "collision")):
         assert SumoSimulation(str(crossing(tmp_path, z)), scene, 9.0, 0.1)({}, 1).ended == ended
+
+
+def bus_in_a_bend(path: Path, *, driven: bool, **settings: Any) -> SumoSimulation:
+    """A bus on the outer lane passes a car that stands on the inner one, at the bend."""
+
+    def scene(values: Any, ego: Any, rng: Any) -> Scene:
+        driver = Looking(set()) if driven else None
+        standing = VehicleType(attributes=(("maxSpeed", "0.001"), ("speedFactor", "0.001")))
+        return Scene((
+            Actor("ego", ("bend",), 1, 75.0 + values["p"], 0.0, driver, standing),
+            Actor("co", ("bend",), 0, 30.0, 8.0, driver, BUS),
+        ))  # fmt: skip
+
+    path.write_text(net({"bend": BEND}, lanes=2))
+    return SumoSimulation(str(path), scene, 12.0, 0.1, isolations=("fresh", "reuse", "replicas"), **settings)
+
+
+@pytest.mark.parametrize("driven", [True, False])
+def test_a_long_vehicle_bends_around_who_stands_inside(tmp_path: Path, driven: bool) -> None:
+    """As one rectangle it cut the bend, and hit a car on the next lane that it never met."""
+    trace = bus_in_a_bend(tmp_path / "a.net.xml", driven=driven, isolation="fresh")({"p": 0.0}, 1)
+    assert trace.ended == "duration"
+    bus = trace.actor("co")
+    assert contact_index(trace.actor("ego"), bus) is None
+    assert contact_index(trace.actor("ego"), replace(bus, parts=())) is not None
+    assert sum(part.length for part in bus.parts) == pytest.approx(14.0)
+    for one, following in pairwise(bus.parts):
+        joints = [(p.x + s * 0.5 * p.length * np.cos(p.heading), p.y + s * 0.5 * p.length * np.sin(p.heading))
+                  for p, s in ((one, -1.0), (following, 1.0))]  # fmt: skip
+        assert np.hypot(*(np.array(joints[0]) - np.array(joints[1]))).max() < 0.1, "the parts follow each other"
+
+
+def test_long_bodies_are_the_same_in_every_isolation(tmp_path: Path) -> None:
+    path = tmp_path / "a.net.xml"
+    work = [({"p": p}, 1) for p in (0.0, 3.0, 6.0)]
+    fresh = [bus_in_a_bend(path, driven=True, isolation="fresh")(*one) for one in work]
+    for isolation in ("reuse", "replicas"):
+        for a, b in zip(fresh, bus_in_a_bend(path, driven=True, isolation=isolation).simulate_many(work), strict=True):
+            assert a.parts
+            assert a.identical(b)
+
+
+def test_a_run_ends_where_metrics_see_a_bent_body_touch(tmp_path: Path) -> None:
+    path = tmp_path / "a.net.xml"
+    path.write_text(net({"bend": BEND}, lanes=1))
+
+    def scene(values: Any, ego: Any, rng: Any) -> Scene:
+        return Scene((
+            Actor("ego", ("bend",), 0, 60.0, 9.0, Looking(set())),
+            Actor("co", ("bend",), 0, 90.0, 0.0, Looking(set()), VehicleType(18.0, 2.5)),
+        ))  # fmt: skip
+
+    trace = SumoSimulation(str(path), scene, 12.0, 0.1)({}, 1)
+    found = contact_index(trace.actor("ego"), trace.actor("co"))
+    assert trace.ended == "collision"
+    assert found == len(trace.time) - 1

@@ -7,7 +7,7 @@ the traffic has appeared right before or behind the ego in the middle of a run.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
 from sbt.errors import RunError
@@ -15,7 +15,7 @@ from sbt.problem.outcome import Status
 from sbt.problem.trace import ActorTrace
 from sbt.sumo.actors import State
 from sbt.sumo.off_lanes import parking
-from sbt.sumo.overlaps import deepest_overlap, instant, is_behind, required_braking
+from sbt.sumo.overlaps import deepest_overlap, is_behind, required_braking
 from sbt.sumo.places import inserted_at, said_at
 
 __all__ = ["AppearanceMonitor", "refuse_overlap_at_start"]
@@ -46,22 +46,22 @@ class _Surroundings(Protocol):
     def body(self, name: str) -> ActorTrace: ...
 
 
-def refuse_overlap_at_start(ego: State, others: Iterable[State], remedy: str, place: str = "") -> None:
+def refuse_overlap_at_start(
+    ego: str, body: ActorTrace, others: Mapping[str, ActorTrace], remedy: str, place: str = ""
+) -> None:  # fmt: skip
     """Check that the ego starts clear of all others.
 
     Args:
-        ego: at its start.
-        others: all that are present then.
+        ego: its id.
+        body: its body at its start.
+        others: bodies of all that are present then, by name.
         remedy: what to change.
         place: `file:line:column: ` of the ego, or "".
 
     Raises:
         RunError: it overlaps or touches one of them.
     """
-    _refuse_start(ego.name, deepest_overlap(instant(ego), {other.name: instant(other) for other in others}), remedy, place)
-
-
-def _refuse_start(ego: str, found: tuple[str, float] | None, remedy: str, place: str) -> None:
+    found = deepest_overlap(body, others)
     if found is not None:
         raise RunError(
             Status.INVALID,
@@ -102,10 +102,10 @@ class AppearanceMonitor:
         self._parked, self._unparked = map(frozenset, parking(simulation))
         new = near.newcomers()
         if len(near) == 1:
-            found = deepest_overlap(near.body(self._ego), {name: near.body(name) for name in new})
             remedy = "change its departPos or depart, or keep the inputs apart by constraints"
             place = self._departures.place_of(self._ego)
-            _refuse_start(self._ego, found, remedy, place)
+            bodies = {name: near.body(name) for name in new}
+            refuse_overlap_at_start(self._ego, near.body(self._ego), bodies, remedy, place)
             if inserted_at(place):  # a place among traffic, which is drawn: not the scenario that anybody meant
                 self._refuse_close(near, [name for name in new if name not in self._departures.asked], place, remedy)
         elif new:

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
-__all__ = ["Lanes", "path_behind"]
+from sbt.sumo.trailing import TrailingBody
+
+__all__ = ["Lanes", "path_behind", "trailing_body"]
 
 _BESIDE = 4.0
 """Distance (m) that a vehicle may be beside the middle of its lane, and its lane's end beside the junction."""
@@ -77,6 +80,11 @@ class Lanes:
             return True
         rooms = {name: room - self._lane.getLength(name) for name in following}
         return any(left >= 0.0 and self._found(name, other, left) for name, left in rooms.items())
+
+
+def trailing_body(sumo: Any, lanes: Lanes, name: str, length: float) -> TrailingBody:
+    """Return the body of a long vehicle that is in SUMO, which has not been seen to drive yet."""
+    return TrailingBody(length, partial(path_behind, sumo, lanes, name, length=length), lanes.leads_to)
 
 
 def path_behind(sumo: Any, lanes: Lanes, name: str, front: Point, length: float) -> list[Point]:

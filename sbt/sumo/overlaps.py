@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from sbt.metrics.geometry import overlap_depth, part_pairs
 from sbt.problem.trace import ActorTrace
 from sbt.sumo.actors import State
 
-__all__ = ["Rectangle", "deepest_overlap", "instant", "is_behind", "required_braking", "separate", "state_in_sumo"]
+__all__ = ["Rectangle", "deepest_overlap", "instant", "is_behind", "may_touch", "required_braking", "state_in_sumo"]
 
 Rectangle = tuple[float, float, float, float, float]
 """x, y (m), heading (rad), length and width (m)."""
@@ -84,7 +85,15 @@ def instant(state: State) -> ActorTrace:
     return ActorTrace(x, y, heading, speed, acceleration, state.length, state.width)
 
 
-def separate(a: Rectangle, b: Rectangle, a_0: Rectangle, b_0: Rectangle) -> bool:
+def may_touch(
+    own: Sequence[Rectangle], own_0: Sequence[Rectangle], other: Sequence[Rectangle], other_0: Sequence[Rectangle]
+) -> bool:
+    """Return whether no axis separates any rectangle of one body from any of another during a step, from the states _0 on."""
+    pairs = product(zip(own, own_0, strict=True), zip(other, other_0, strict=True))
+    return any(not _separate(a, b, a_0, b_0) for (a, a_0), (b, b_0) in pairs)
+
+
+def _separate(a: Rectangle, b: Rectangle, a_0: Rectangle, b_0: Rectangle) -> bool:
     """Return whether an axis of one rectangle separates both during a whole step, from the states _0 on."""
     dx, dy, dx_0, dy_0 = b[0] - a[0], b[1] - a[1], b_0[0] - a_0[0], b_0[1] - a_0[1]
     turn = b[2] - a[2]

@@ -13,9 +13,6 @@ from sbt.sumo.off_lanes import POSITION, VEHICLE
 
 __all__ = ["SceneLevels"]
 
-_NOBODY: frozenset[int] = frozenset()
-
-
 class SceneLevels:
     """The levels of a scene, step by step. An actor that begins by a pose is on the level of the lane that it names.
 
@@ -71,6 +68,6 @@ class SceneLevels:
         """Return those of some actors who are on the level of actor k, now."""
         return [j for j in others if j not in self._elsewhere[k]]
 
-    def arrived(self) -> frozenset[int]:
-        """Return who was on another level than the ego in the step before."""
-        return self.hidden[-2] if len(self.hidden) > 1 else _NOBODY
+    def was_there(self, j: int) -> bool:
+        """Return whether actor j was on the ego's level in the step before."""
+        return len(self.hidden) < 2 or j not in self.hidden[-2]

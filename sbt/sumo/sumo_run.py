@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,9 @@ from sbt.sumo.contacts import CONFIRMED_WITHIN, collisions_of, unconfirmed_conta
 from sbt.sumo.dead_ends import refuse_dead_ends
 from sbt.sumo.dynamics import MAX_SPEED, next_speed
 from sbt.sumo.insertion import LANE_REQUEST_DURATION, pose_setter
+from sbt.sumo.overlaps import instant
 from sbt.sumo.reading import ROW, Onlooker, observer, table
+from sbt.sumo.scene_bodies import SceneBodies, may_meet
 from sbt.sumo.scene_levels import SceneLevels
 from sbt.sumo.session import is_ballistic, unwrapped
 
@@ -60,6 +62,7 @@ class SumoRun:
         self._ended = ""
         self._sumo, self._prefix = sumo, prefix
         self._levels = None if one_level else SceneLevels.of(sumo, scene.actors)
+        self._bodies = SceneBodies.of(sumo, scene.actors, self._dt, prefix)
         self.advance, self.recorded = self._functions(sumo, prefix)
 
     def _functions(self, sumo: Any, prefix: str) -> tuple[Callable[[], bool], Callable[[], int]]:
@@ -69,9 +72,9 @@ class SumoRun:
         for actor, state in zip(scene.actors, states, strict=True):
             state.steered = None if actor.pose is None else float(actor.speed)
         until, probes = scene.until, tuple(scene.signals.values())
-        levels = self._levels
-        control = _control(sumo, scene.actors, states, dt, prefix, levels)
-        touching = _contact_test(states, rows, dt)
+        control = _control(sumo, scene.actors, states, dt, prefix, self._levels)
+        touching = _contact_test(states, rows, dt, self._bodies, self._levels)
+        watch = None if self._bodies is None and self._levels is None else self._watch
         solid = [k for k, a in enumerate(scene.actors) if not a.person][1:]
         by_name: Mapping[str, State]
         if probes or any(a.driver is not None for a in scene.actors):  # they look at states
@@ -87,16 +90,13 @@ class SumoRun:
             k += 1
             t = k * dt
             observe(k)
-            if levels is not None:
-                levels.look(t, by_name)
+            if watch is not None:
+                watch(t, by_name)
             if k == 0:
                 for state in states:
                     by_name[state.name]
-                standing = [_standing(obstacle) for obstacle in scene.obstacles if obstacle.solid]
-                others = range(1, len(states)) if levels is None else levels.on_its(0, range(1, len(states)))
-                refuse_overlap_at_start(states[0], (*[states[j] for j in others], *standing), _START_REMEDY)
-            near = solid if look is None else look.near(k)
-            touched = touching(k, near) if levels is None else touching(k, levels.on_its(0, near), levels.arrived())
+                self._check_start(states)
+            touched = touching(k, solid if look is None else look.near(k))
             if touched is not None:
                 self._judge(sumo, prefix, t, touched)
             ended = "collision" if touched is not None else until(t, by_name) if until is not None else None
@@ -113,6 +113,22 @@ class SumoRun:
             return False
 
         return advance, lambda: k + 1
+
+    def _watch(self, t: float, states: Mapping[str, State]) -> None:
+        """Note the long bodies and the levels of a step."""
+        if self._bodies is not None:
+            self._bodies.move(states)
+        if self._levels is not None:
+            self._levels.look(t, states)
+
+    def _check_start(self, states: list[State]) -> None:
+        """Check that the ego starts clear of all on its level, and of all obstacles."""
+        levels, bodies, others = self._levels, self._bodies, list(range(1, len(states)))
+        there = [states[j] for j in (0, *(others if levels is None else levels.on_its(0, others)))]
+        there += [_standing(obstacle) for obstacle in self._scene.obstacles if obstacle.solid]
+        found = {s.name: instant(s) if bodies is None else bodies.bent(s.name, instant(s), 0) for s in there}
+        own = found.pop(states[0].name)
+        refuse_overlap_at_start(states[0].name, own, found, _START_REMEDY)
 
     def record_collision(self, collider: str, victim: str) -> None:
         """Record a collision that SUMO reports for the state that `advance` will read next."""
@@ -163,6 +179,7 @@ class SumoRun:
             self._ended,
             tuple(self._collisions),
             {name: np.array([row[k] for row in self._signals]) for k, name in enumerate(scene.signals)},
+            parts={} if self._bodies is None else self._bodies.parts({a.name: states[:, k] for k, a in enumerate(actors)}),
             unconfirmed=(*self._unconfirmed, *(() if self._levels is None else self._levels.notes)),
             ballistic=is_ballistic(self._sumo),
             flat=tuple(o.name for o in scene.obstacles if not o.solid),
@@ -240,35 +257,49 @@ _Touch = tuple[str, ActorTrace, ActorTrace]
 """Who touched the ego, and the rectangles that touch: the ego's and the other's."""
 
 
-def _contact_test(states: list[State], rows: bytearray, dt: float) -> Callable[..., _Touch | None]:
+def _contact_test(
+    states: list[State], rows: bytearray, dt: float, bodies: SceneBodies | None, levels: SceneLevels | None
+) -> Callable[[int, list[int]], _Touch | None]:
     """Return the function that tells which of some rectangles the first actor, the ego, touched in the step to row k, or None.
 
-    It takes k, the numbers of the others, and of those who were on another level in row k - 1, whose step is not looked at. The
-    exact test is left to pairs that are neither far apart nor separated by an axis of the ego's rectangle.
+    The exact test is left to pairs that are neither far apart nor separated by an axis of the ego's rectangle. Of who was on
+    another level in row k - 1 only row k is looked at.
     """
-    ego, near = states[0], 2.0 * max(s.length for s in states)
+    ego, near = states[0], (2.0 if bodies is None else 3.0) * max(s.length for s in states)
     width, place = ROW.size * len(states), struct.Struct("=2d").unpack_from
-    columns = [(s, j, ROW.size * j) for j, s in enumerate(states)]
+    bends = [bodies is not None and (ego.name in bodies or s.name in bodies) for s in states]
+    columns = [(s, j, ROW.size * j, bends[j]) for j, s in enumerate(states)]
     length, breadth = 0.5 * ego.length + _SLACK, 0.5 * ego.width + _SLACK
 
-    def touching(k: int, others: list[int], arrived: Collection[int] = ()) -> _Touch | None:
+    def separate(before: int, other: State, column: int, dx: float, dy: float) -> bool:
+        (x_0, y_0), (u_0, v_0) = place(rows, before), place(rows, before + column)
+        cos, sin, dx_0, dy_0 = ego.cos, ego.sin, u_0 - x_0, v_0 - y_0
+        turn_cos, turn_sin = abs(other.cos * cos + other.sin * sin), abs(other.sin * cos - other.cos * sin)
+        along = length + 0.5 * (other.length * turn_cos + other.width * turn_sin)
+        ahead, ahead_0 = dx * cos + dy * sin, dx_0 * cos + dy_0 * sin
+        if (ahead > along and ahead_0 > along) or (ahead < -along and ahead_0 < -along):
+            return True
+        across = breadth + 0.5 * (other.length * turn_sin + other.width * turn_cos)
+        left, left_0 = dy * cos - dx * sin, dy_0 * cos - dx_0 * sin
+        return (left > across and left_0 > across) or (left < -across and left_0 < -across)
+
+    def touching(k: int, others: list[int]) -> _Touch | None:
         x, y, speed = ego.x, ego.y, ego.speed
-        for other, j, column in [columns[j] for j in others]:
+        if levels is not None:
+            others = levels.on_its(0, others)
+        for other, j, column, bent in [columns[j] for j in others]:
             dx, dy, reach = other.x - x, other.y - y, near + (speed + other.speed) * dt
             if -reach < dx < reach and -reach < dy < reach:
-                (x_0, y_0), (u_0, v_0) = place(rows, max(k - 1, 0) * width), place(rows, max(k - 1, 0) * width + column)
-                cos, sin, dx_0, dy_0 = ego.cos, ego.sin, u_0 - x_0, v_0 - y_0
-                turn_cos, turn_sin = abs(other.cos * cos + other.sin * sin), abs(other.sin * cos - other.cos * sin)
-                along = length + 0.5 * (other.length * turn_cos + other.width * turn_sin)
-                ahead, ahead_0 = dx * cos + dy * sin, dx_0 * cos + dy_0 * sin
-                if (ahead > along and ahead_0 > along) or (ahead < -along and ahead_0 < -along):
+                if not bent and separate(max(k - 1, 0) * width, other, column, dx, dy):
                     continue
-                across = breadth + 0.5 * (other.length * turn_sin + other.width * turn_cos)
-                left, left_0 = dy * cos - dx * sin, dy_0 * cos - dx_0 * sin
-                if (left > across and left_0 > across) or (left < -across and left_0 < -across):
-                    continue
-                step = table(rows, k if j in arrived else max(k - 1, 0), k + 1, len(states))
-                found = contact_part(_track(step, 0, ego), _track(step, j, other))
+                first = max(k - 1, 0) if levels is None or levels.was_there(j) else k
+                step = table(rows, first, k + 1, len(states))
+                own, its = _track(step, 0, ego), _track(step, j, other)
+                if bodies is not None:
+                    own, its = bodies.bent(ego.name, own, first), bodies.bent(other.name, its, first)
+                    if bent and not may_meet(own, its):
+                        continue
+                found = contact_part(own, its)
                 if found is not None:
                     return other.name, found[1], found[2]
         return None

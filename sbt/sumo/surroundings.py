@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -25,11 +24,11 @@ from sbt.sumo.ego_level import EgoLevel
 from sbt.sumo.guided import Placed
 from sbt.sumo.identity import check_sizes, refuse_twice
 from sbt.sumo.junctions import Junctions
-from sbt.sumo.lanes_behind import Lanes, path_behind
+from sbt.sumo.lanes_behind import Lanes, trailing_body
 from sbt.sumo.levels import is_known
 from sbt.sumo.nearby import Nearby
 from sbt.sumo.off_lanes import ANGLE, POSITION, SPEED, VEHICLE, off_lanes, parking, placed_variables, read
-from sbt.sumo.overlaps import Rectangle, separate
+from sbt.sumo.overlaps import Rectangle, may_touch
 from sbt.sumo.session import INVALID_DOUBLE, is_ballistic
 from sbt.sumo.tables import table_of
 from sbt.sumo.teleports import Teleports
@@ -288,8 +287,7 @@ class Surroundings:
         state = self.states[name] = State(name, float(domain.getLength(name)), float(domain.getWidth(name)), self._dt)
         self._centre_offsets[name] = 0.0 if person else 0.5 * state.length
         if not person and state.length > LONGEST_RIGID:
-            behind = partial(path_behind, self._sumo, self._lanes, name, length=state.length)
-            self._bodies[name] = TrailingBody(state.length, behind, self._lanes.leads_to)
+            self._bodies[name] = trailing_body(self._sumo, self._lanes, name, state.length)
         return state
 
     def touching(self) -> list[tuple[str, ActorTrace, ActorTrace]]:
@@ -332,12 +330,7 @@ class Surroundings:
         """Return whether no axis of a rectangle separates any of the ego's from the other's during the last step."""
         now, before = len(self._rows) - 1, max(len(self._rows) - 2, 0)
         before = before if name in self._rows[before] else now
-        own_0, own, other_0, other = (self._rectangles(who, k) for who in (self._ego, name) for k in (before, now))
-        return any(
-            not separate(a, b, a_0, b_0)
-            for a, a_0 in zip(own, own_0, strict=True)
-            for b, b_0 in zip(other, other_0, strict=True)
-        )
+        return may_touch(*(self._rectangles(who, k) for who in (self._ego, name) for k in (now, before)))
 
     def _rectangles(self, name: str, k: int) -> list[Rectangle]:
         """Return the rectangles of a road user at an instant."""
