@@ -19,6 +19,7 @@ from typer.testing import CliRunner
 from sbt.cli import app
 from sbt.errors import InputError
 from sbt.metrics.fcd import catalogue, encounters, near_pairs, pair_traces, read_fcd
+from sbt.metrics.longitudinal import COLLISION
 
 ENTITY = '<!DOCTYPE fcd-export [<!ENTITY x SYSTEM "file:///etc/passwd">]><fcd-export>&x;</fcd-export>'
 
@@ -209,3 +210,60 @@ def test_sumos_file_gives_the_metrics_of_the_recorded_trace(tmp_path):
     for metric in catalogue():
         assert metric(found) == pytest.approx(metric(trace), rel=1e-5, abs=1e-4), metric.name
     assert not math.isclose(next(m for m in catalogue() if m.name == "ttc_min")(found), 10.0)
+
+
+def on_a_viaduct(step: float, above: float | None, slope: float | None = None) -> list[dict]:
+    """Two cars that meet in the plane where their roads cross, at 15 m/s; one is so high above the other (m)."""
+    rows = []
+    for t in np.arange(0.0, 12.0 + 1e-9, step):
+        for name, x, y, angle, z in (("7", 15.0 * (t - 6.0), 0.0, 90.0, 0.0), ("8", 0.0, 15.0 * (t - 6.0), 0.0, above)):
+            heights = {} if above is None else {"z": z} if slope is None else {"z": z, "slope": slope}
+            rows.append(row(float(t), name, x, y, angle, 15.0, **heights))
+    return rows
+
+
+def ramp(x: float) -> tuple[float, float]:
+    """Height (m) and slope (degrees) of a road that rises from 0 to 6 m over 60 m, and of one below it from there on."""
+    return min(max(0.1 * (x - 100.0), 0.0), 6.0), math.degrees(math.atan(0.1)) if 100.0 < x < 160.0 else 0.0
+
+
+@pytest.mark.parametrize("step", [0.1, 1.0])
+@pytest.mark.parametrize("write", [as_xml, as_csv])
+def test_who_is_on_a_bridge_does_not_meet_who_is_below(tmp_path: Path, write, step: float) -> None:
+    """The file's z was not read: they collided in every metric."""
+    suffix = "xml" if write is as_xml else "csv"
+    pairs = {}
+    for above in (None, 0.5, 6.0):
+        recording = read_fcd(written(tmp_path, f"{above}.{suffix}", write(on_a_viaduct(step, above))))
+        pairs[above] = list(encounters(recording, 50.0))
+    assert pairs[6.0] == []
+    for above in (None, 0.5):
+        assert [COLLISION(trace) for *_, trace in pairs[above]] == [1.0, 1.0]
+
+
+def test_who_drives_on_behind_or_ahead_on_a_ramp_is_on_the_same_level(tmp_path: Path) -> None:
+    """Also where the slopes of both roads, which are flat there, do not lead to the other's height."""
+    rows = [row(float(t), name, x, 0.0, 90.0, 15.0, z=ramp(x)[0], slope=ramp(x)[1])
+            for t in np.arange(0.0, 20.0, 0.5) for name, x in (("7", 15.0 * t), ("8", 15.0 * t + 70.0))]  # fmt: skip
+    below = [row(float(t), "9", 200.0, 15.0 * t - 100.0, 0.0, 15.0, z=0.0, slope=0.0) for t in np.arange(0.0, 20.0, 0.5)]
+    recording = read_fcd(written(tmp_path, "a.xml", as_xml(sorted(rows + below, key=lambda one: one["time"]))))
+    assert recording.stacked
+    (trace,) = pair_traces(recording, 0, 1)
+    assert len(trace.time) == 40
+    assert near_pairs(recording, 75.0) == [(0, 1)]
+
+
+def test_heights_of_hills_change_nothing(tmp_path: Path) -> None:
+    hill = [one | {"z": 0.12 * one["x"]} for one in DRIVE]
+    plain, high = (read_fcd(written(tmp_path, f"{k}.xml", as_xml(rows))) for k, rows in enumerate((DRIVE, hill)))
+    assert not high.stacked
+    assert all(a[2].identical(b[2]) for a, b in zip(encounters(plain, 100.0), encounters(high, 100.0), strict=True))
+
+
+def test_collisions_in_a_file_without_heights_are_told_to_be_in_the_plane(tmp_path: Path) -> None:
+    for above, told in ((None, True), (0.5, False)):
+        path = written(tmp_path, f"{above}.xml", as_xml(on_a_viaduct(0.1, above)))
+        result = CliRunner().invoke(app, ["metrics", str(path), "--json"])
+        assert result.exit_code == 0
+        assert json.loads(result.stdout)["heights"] is not told
+        assert ("no heights (z)" in result.stderr) is told

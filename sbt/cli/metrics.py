@@ -42,6 +42,10 @@ def metrics(
             | {metric.name: _value(metric, trace) for metric in measured}
             for ego, other, trace in encounters(recording, within)
         ]  # fmt: skip
+    touching = sum(row.get("collision") == 1.0 for row in rows)
+    if recording.z is None and touching:
+        what = f"{touching} of {len(rows)} rows have a collision, and '{file}' has no heights (z)"
+        print(f"note: {what}: who is on a bridge touches who is below it in the plane", file=sys.stderr)
     columns = ["ego", "other", "begin", "end", *(metric.name for metric in measured)]
     if out is not None:
         try:
@@ -52,7 +56,7 @@ def metrics(
     if as_json:
         units = {metric.name: metric.unit for metric in measured}
         print_json({"file": str(file), "road_users": len(recording.names), "steps": len(recording.time),
-                    "within": within, "units": units, "pairs": rows})  # fmt: skip
+                    "heights": recording.z is not None, "within": within, "units": units, "pairs": rows})  # fmt: skip
     elif out is None:
         _write(sys.stdout, columns, rows)
     else:

@@ -4,8 +4,9 @@ Reads XML, CSV (separated by `,` or `;`), both also gzipped, and Parquet, with S
 (`timestep_time`, `vehicle_x`, `person_x`, ...) or plain ones (`time`, `id`, `x`, `y`, `angle`, `speed`). SUMO's
 positions are those of the front bumper, and its angles are degrees clockwise from north; both are converted here.
 Sizes and accelerations are read where the file has them (`length`, `width`, `acceleration`); otherwise sizes are
-arguments of the reader, and accelerations are finite differences of the speeds. SUMO writes two decimal places by
-default; `--precision 6` is recommended.
+arguments of the reader, and accelerations are finite differences of the speeds. Heights (`z`, and `slope` in degrees) tell who
+is on a bridge and who is below; without them all is one level. SUMO writes two decimal places by default; `--precision 6` is
+recommended.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import math
 from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -25,6 +27,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from sbt.errors import InputError
+from sbt.metrics import heights
 from sbt.metrics.geometry import farthest
 from sbt.metrics.pairwise import without_overtaking
 from sbt.plugins import load, names
@@ -36,7 +39,7 @@ __all__ = ["PERSON_SIZE", "Recording", "catalogue", "encounters", "near_pairs", 
 
 PERSON_SIZE = (0.215, 0.478)
 """Length and width of a person whose size is not in the file (m): SUMO's default pedestrian."""
-_COLUMNS = ("time", "x", "y", "angle", "speed", "acceleration", "length", "width")
+_COLUMNS = ("time", "x", "y", "angle", "speed", "acceleration", "length", "width", "z", "slope")
 _REQUIRED = ("time", "id", "x", "y", "angle", "speed")
 _KINDS = ("vehicle", "person")
 
@@ -74,6 +77,24 @@ class Recording:
     width: Vector
     kinds: tuple[str, ...] = ()
     """m texts, such as vehicle, person, truck or bicycle."""
+    z: Vector | None = None
+    """(n,) height, of the front bumper of a vehicle (m), NaN where it is not known; None where the file has none."""
+    rise: Vector | None = None
+    """(n,) of the road, along the heading (m/m), 0 where it is not known; None where the file has no heights."""
+
+    @cached_property
+    def stacked(self) -> bool:
+        """Whether road users were one above the other, so that heights tell levels: hills hide nobody."""
+        if self.z is None:
+            return False
+        user = np.repeat(np.arange(len(self.names)), np.diff(self.start))
+        return heights.are_stacked(self.path(slice(None)), np.diff(user) == 0)
+
+    def path(self, rows: slice) -> heights.Path:
+        """Return the places of some rows; the file must have heights."""
+        z, rise = (np.full(len(self.x), np.nan) if each is None else each for each in (self.z, self.rise))
+        heading = self.heading[rows]
+        return heights.Path(self.x[rows], self.y[rows], z[rows], rise[rows] * np.cos(heading), rise[rows] * np.sin(heading))
 
 
 def read_fcd(path: Path, *, length: float = 5.0, width: float = 1.8) -> Recording:
@@ -140,10 +161,12 @@ def recording_of_columns(path: Path, ids: Any, kinds: Any, columns: dict[str, An
     half = 0.5 * lengths[user]
     acceleration = _differences(data["speed"], time[step], start)
     acceleration = np.where(np.isnan(data["acceleration"]), acceleration, data["acceleration"])
+    z, slope = (data.get(name, np.full(len(order), np.nan)) for name in ("z", "slope"))
+    rise = np.tan(np.radians(np.nan_to_num(slope)))
     return Recording(
         tuple(users.tolist()), time, start, step.astype(np.int64), data["x"] - half * np.cos(heading),
         data["y"] - half * np.sin(heading), heading, data["speed"], acceleration, lengths, widths,
-        tuple(np.array(_KINDS)[person.astype(int)].tolist()),
+        tuple(np.array(_KINDS)[person.astype(int)].tolist()), *((None, None) if np.isnan(z).all() else (z, rise)),
     )  # fmt: skip
 
 
@@ -255,7 +278,7 @@ def catalogue() -> tuple[Metric, ...]:
 
 
 def near_pairs(recording: Recording, within: float) -> list[tuple[int, int]]:
-    """Return the sorted pairs of road users whose centres come within a distance of each other (m) at some time."""
+    """Return the sorted pairs of road users whose centres come within a distance of each other (m) on one level."""
     m = len(recording.names)
     user = np.repeat(np.arange(m), np.diff(recording.start))
     order = np.argsort(recording.step, kind="stable")
@@ -267,19 +290,37 @@ def near_pairs(recording: Recording, within: float) -> list[tuple[int, int]]:
         near = cKDTree(points[rows]).query_pairs(within, output_type="ndarray")
         one, two = user[rows[near[:, 0]]], user[rows[near[:, 1]]]
         found.update((np.minimum(one, two) * m + np.maximum(one, two)).tolist())
-    return [divmod(code, m) for code in sorted(found)]
+    pairs = [divmod(code, m) for code in sorted(found)]
+    return [pair for pair in pairs if _is_near(recording, *pair, within)] if recording.stacked else pairs
+
+
+def _together(recording: Recording, one: int, two: int) -> tuple[Integers, Integers]:
+    """Return the time steps at which two road users are there on one level, and the (t, 2) rows of both."""
+    spans = [slice(recording.start[k], recording.start[k + 1]) for k in (one, two)]
+    step_one, step_two = (recording.step[s] for s in spans)
+    steps, at_one, at_two = np.intersect1d(step_one, step_two, assume_unique=True, return_indices=True)
+    rows = np.stack([at_one + spans[0].start, at_two + spans[1].start], axis=1)
+    if not recording.stacked:
+        return steps, rows
+    level = heights.on_one_level(recording.path(spans[0]), recording.path(spans[1]), at_one, at_two)
+    return steps[level], rows[level]
+
+
+def _is_near(recording: Recording, one: int, two: int, within: float) -> bool:
+    """Return whether two road users come within a distance (m) while they are on one level."""
+    (x, u), (y, v) = (values[_together(recording, one, two)[1]].T for values in (recording.x, recording.y))
+    return bool((np.hypot(u - x, v - y) <= within).any())
 
 
 def pair_traces(recording: Recording, ego: int, other: int) -> Iterator[Trace]:
     """Yield a trace of the actors `ego` and `co` for every interval in which both are present.
 
-    An interval ends where a time step of the file lacks one of them, or where one of them was teleported. Times are
-    those of the file.
+    An interval ends where a time step of the file lacks one of them, where they are on different levels (`Recording.z`), or
+    where one of them was teleported. Times are those of the file.
     """
-    spans = [slice(recording.start[k], recording.start[k + 1]) for k in (ego, other)]
-    step_ego, step_other = (recording.step[s] for s in spans)
-    steps, at_ego, at_other = np.intersect1d(step_ego, step_other, assume_unique=True, return_indices=True)
-    rows = np.stack([at_ego + spans[0].start, at_other + spans[1].start], axis=1)  # (t, 2)
+    steps, rows = _together(recording, ego, other)
+    if not len(steps):
+        return
     time = recording.time[steps]
     moved = np.hypot(np.diff(recording.x[rows], axis=0), np.diff(recording.y[rows], axis=0)).max(axis=1)
     cut = (np.diff(steps) > 1) | (moved > farthest(np.diff(time)))
