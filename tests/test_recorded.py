@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from test_evidence import SOUTH_NORTH, TYPES, WEST_EAST, net, vehicle
 
 from sbt.errors import InputError, RunError
 from sbt.execution.spec import ScenarioSpec
@@ -14,8 +15,13 @@ from sbt.metrics.conflict_types import conflict_type, describe_conflict_type
 from sbt.metrics.fcd import read_fcd
 from sbt.metrics.tracks import read_meta, read_recording
 from sbt.problem.outcome import Doubt, Status, doubts
-from sbt.sumo.recorded import recorded_tracks
+from sbt.sumo.ego import Ego
+from sbt.sumo.ego_vehicle import EgoVehicle
+from sbt.sumo.files import SumoFiles
+from sbt.sumo.recorded import RecordedTraffic, recorded_tracks
 from sbt.sumo.recorded_net import extent, motorway
+from sbt.sumo.recorder import RecordingSettings
+from sbt.sumo.user_simulation import UserSimulation
 
 CAR, TRUCK, RATE = (4.5, 1.8), (12.0, 2.5), 25
 FRAMES = np.arange(1, 126)
@@ -217,3 +223,29 @@ def test_mistakes_are_named(tmp_path):
         path.write_text(SCENARIO.replace("BEGIN", "${t}").replace("WITHOUT", "").replace(old, new))
         with pytest.raises(InputError, match=words):
             ScenarioSpec(str(path)).resolve()
+
+
+@pytest.mark.sumo
+@pytest.mark.parametrize("driver", [None, Ego.of("acc_aeb")])
+@pytest.mark.parametrize(("z", "told"), [(6.0, False), (0.5, False), (None, True)])
+def test_a_recorded_road_user_is_at_its_own_height(tmp_path: Path, z: float | None, told: bool, driver: Ego | None) -> None:
+    """On the bridge it was taken to be at the height of the ego below, which braked for it, and was hit."""
+    decks = {"we": [(x, y, 0.0) for x, y in WEST_EAST], "sn": [(x, y, 6.0) for x, y in SOUTH_NORTH]}
+    (tmp_path / "a.net.xml").write_text(net(decks, z=True))
+    (tmp_path / "a.rou.xml").write_text(f"<routes>{TYPES}{vehicle('ego', 'we', departPos=20)}</routes>")
+    height = "" if z is None else f' z="{z}"'
+    steps = "".join(
+        f'<timestep time="{t:.1f}"><vehicle id="co" x="0" y="2.5" angle="0" speed="0"{height}/></timestep>'
+        for t in np.arange(0.0, 15.0, 0.1)
+    )
+    (tmp_path / "a.xml").write_text(f"<fcd-export>{steps}</fcd-export>")
+    files = SumoFiles.of({"net-file": "a.net.xml", "route-files": "a.rou.xml"}, tmp_path, "test")
+    recording = RecordingSettings(EgoVehicle("ego", driver=driver, may_leave=True), 12.0)
+    one = UserSimulation(recording, files, participants=(RecordedTraffic(tmp_path / "a.xml"),), step=0.1)
+    trace = one({}, 1)
+    assert ("co" in trace.actors) is (z != 6.0)
+    if driver is None:
+        assert (trace.ended == "collision") is (z != 6.0)
+    else:
+        assert bool(trace.acceleration[:, 0].min() < -1.0) is (z != 6.0)
+    assert any("recorded road users are taken to be on the ego's level" in line for line in one.warnings()) is told

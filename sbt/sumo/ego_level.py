@@ -93,16 +93,19 @@ class EgoLevel:
         domain, gone = self._sumo.person if person else self._sumo.vehicle, ego.name in off
         self._ground = Ground.under(self._sumo, domain, ego.name, self._at, off=gone) if self._levels.stacked else None
 
-    def is_other(self, name: str, variables: Mapping[int, Any], *, long: bool) -> bool:
+    def is_other(self, name: str, variables: Mapping[int, Any], *, long: bool, placed: bool = False) -> bool:
         """Return whether a road user is on another level.
 
         Args:
             name: its id.
             variables: of it in this step.
             long: it is very long: the place that its body covers next to the ego decides.
+            placed: it was put there, at this height, which alone decides; not known (NaN): on the ego's level.
         """
         if self._ground is None and self._apart is None:
             return False
+        if placed:
+            return self._ground is not None and self._is_placed_below(self._ground, name, variables)
         person, off = VEHICLE in variables, name in self._off
         place: Place
         if off:
@@ -119,6 +122,14 @@ class EgoLevel:
         if (self._road, road) not in self._notes:
             self._note(road, name, variables, person=person)
         return True
+
+    def _is_placed_below(self, ground: Ground, name: str, variables: Mapping[int, Any]) -> bool:
+        """Return whether who was put somewhere is on another level; SUMO may have it on a lane of another one."""
+        person, place = VEHICLE in variables, variables[POSITION]
+        if math.isnan(place[2]):
+            return False
+        astray = not person and abs(self._sumo.vehicle.getPosition3D(name)[2] - place[2]) >= LEVEL_HEIGHT
+        return ground.is_below(name, place, person=person, off=astray or not road_of(self._sumo, name, person=person))
 
     def _note(self, road: str, name: str, variables: Mapping[int, Any], *, person: bool) -> None:
         if math.dist(self._at[:2], variables[POSITION][:2]) > self._ego.length + _LONGEST:

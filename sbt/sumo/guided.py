@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, Protocol
@@ -25,7 +26,8 @@ _HARDEST = 10.0
 class Placed(NamedTuple):
     """Where a road user was put by position: SUMO knows neither its speed nor, off the lanes, that it is near.
 
-    x, y (m) of the front bumper of a vehicle or the centre of a person; angle in degrees, clockwise from north; speed in m/s.
+    x, y (m) of the front bumper of a vehicle or the centre of a person; angle in degrees, clockwise from north; speed in m/s;
+    z (m), NaN where it is not known.
     """
 
     x: float
@@ -33,6 +35,7 @@ class Placed(NamedTuple):
     angle: float
     speed: float
     person: bool = False
+    z: float = math.nan
 
 
 class Motion(Protocol):

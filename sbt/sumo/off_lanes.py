@@ -52,10 +52,10 @@ def _on_no_lane(sumo: Any, vehicle: str) -> bool:
     return not sumo.vehicle.getLaneID(vehicle) and not sumo.vehicle.isStoppedParking(vehicle)
 
 
-def placed_variables(placed: Mapping[str, Placed], z: float) -> dict[str, dict[int, Any]]:
-    """Return the variables of the placed road users, at the ego's height (m)."""
+def placed_variables(placed: Mapping[str, Placed]) -> dict[str, dict[int, Any]]:
+    """Return the variables of the placed road users."""
     return {
-        name: {POSITION: (s.x, s.y, z), ANGLE: s.angle, SPEED: s.speed, **({VEHICLE: ""} if s.person else {})}
+        name: {POSITION: (s.x, s.y, s.z), ANGLE: s.angle, SPEED: s.speed, **({VEHICLE: ""} if s.person else {})}
         for name, s in placed.items()
     }
 

@@ -22,6 +22,7 @@ from sbt.plugins import kept, noted
 from sbt.problem.arrays import Vector
 from sbt.problem.outcome import Status
 from sbt.sumo.guided import Motion, Placed
+from sbt.sumo.levels import levels_of
 from sbt.sumo.session import unwrapped
 from sbt.sumo.template import fill
 
@@ -47,7 +48,8 @@ _SHAPES = {
 class Track(NamedTuple):
     """A road user while it was recorded without interruption: (n,) arrays over time.
 
-    `x`, `y` (m) are of the front bumper of a vehicle or the centre of a person, as SUMO has them; `heading` (rad) has no jumps.
+    `x`, `y` (m) are of the front bumper of a vehicle or the centre of a person, as SUMO has them; `heading` (rad) has no jumps;
+    `z` (m) is NaN where it is not known.
     """
 
     name: str
@@ -59,6 +61,7 @@ class Track(NamedTuple):
     y: Vector
     heading: Vector
     speed: Vector
+    z: Vector
 
     @property
     def person(self) -> bool:
@@ -91,13 +94,14 @@ def _tracks(recording: Recording, k: int) -> list[Track]:
     length, kind = float(recording.length[k]), recording.kinds[k]
     half = 0.0 if kind == "person" else 0.5 * length
     x, y = recording.x[rows] + half * np.cos(heading), recording.y[rows] + half * np.sin(heading)
+    z = np.full(len(x), np.nan) if recording.z is None else recording.z[rows]
     elapsed = np.diff(time)
     usual = float(np.median(elapsed)) if len(elapsed) else 0.0
     cut = (elapsed > _GAP * usual) | (np.hypot(np.diff(x), np.diff(y)) > farthest(elapsed))
     parts = np.split(np.arange(len(time)), np.flatnonzero(cut) + 1)
     return [
         Track(f"{recording.names[k]}#{i}" if i else recording.names[k], kind, length, float(recording.width[k]),
-              time[p], x[p], y[p], heading[p], recording.speed[rows][p])
+              time[p], x[p], y[p], heading[p], recording.speed[rows][p], z[p])
         for i, p in enumerate(parts)
     ]  # fmt: skip
 
@@ -136,6 +140,16 @@ class RecordedTraffic:
         return _Replay(sumo, tracks, float(fill(self.at_zero, values)), self.offset, _recorded(self.path)[1])
 
 
+    def told(self, sumo: Any) -> str:
+        """Return that roads are on different levels, but nobody knows on which the recorded road users are; else ""."""
+        levels = levels_of(sumo)
+        lacking = not levels.stacked or all(np.isnan(track.z).all() for track in recorded_tracks(self.path))
+        if not levels.several or not lacking:
+            return ""
+        who = f"the network has no heights (z) where roads cross, or '{self.path.name}' has none"
+        return f"{who}: recorded road users are taken to be on the ego's level, also those on or under a bridge"
+
+
 class _Span(NamedTuple):
     """From when to when there is a recording (s)."""
 
@@ -163,8 +177,8 @@ class _Moving(NamedTuple):
     """A track at the instants of the steps to come, the last one first."""
 
     person: bool
-    states: list[tuple[float, float, float, float]]
-    """x, y, angle, speed."""
+    states: list[tuple[float, float, float, float, float]]
+    """x, y, angle, speed, z."""
 
 
 class _Replay:
@@ -199,12 +213,12 @@ class _Replay:
                 (self._sumo.person if person else self._sumo.vehicle).remove(name)
                 del self._moving[name]
                 continue
-            x, y, angle, speed = states.pop()
+            x, y, angle, speed, z = states.pop()
             if person:
                 self._move_person(name, "", x, y, angle, _KEEP_ROUTE)
             else:
                 self._move_vehicle(name, "", -1, x, y, angle, _KEEP_ROUTE)
-            self._placed[name] = Placed(x, y, angle, speed, person)
+            self._placed[name] = Placed(x, y, angle, speed, person, z)
 
     def after_step(self) -> Mapping[str, Placed]:
         """Tell SUMO the speeds, which it does not take from positions, and return where everybody is."""
@@ -226,7 +240,7 @@ class _Replay:
         domain.setLength(track.name, track.length)
         domain.setWidth(track.name, track.width)
         times = now + self._dt * np.arange(int((track.time[-1] - now + _SLACK) / self._dt) + 1)
-        x, y, heading, speed = (np.interp(times, track.time, values) for values in track[5:])
+        x, y, heading, speed, z = (np.interp(times, track.time, values) for values in track[5:])
         angle = (90.0 - np.degrees(heading)) % 360.0
-        states = np.column_stack([x + self._offset[0], y + self._offset[1], angle, speed])
-        self._moving[track.name] = _Moving(track.person, [(a, b, c, d) for a, b, c, d in states[::-1].tolist()])
+        states = np.column_stack([x + self._offset[0], y + self._offset[1], angle, speed, z])
+        self._moving[track.name] = _Moving(track.person, [(a, b, c, d, e) for a, b, c, d, e in states[::-1].tolist()])

@@ -152,7 +152,7 @@ class Surroundings:
             rule = f"the ego '{ego}' must walk while it is recorded"
             raise RunError(Status.FAILED, f"{rule}, but it rides in '{near[ego][VEHICLE]}'")
         if self.placed:
-            placed = placed_variables(self.placed, near[ego][POSITION][2])
+            placed = placed_variables(self.placed)
             near.update((name, one) for name, one in placed.items() if name in self._named or self._nearby.is_near(name, one))
         row, parts = dict[str, _Row](), dict[str, int]()
         simulation, self.jumped = self._sumo.simulation, set()
@@ -166,7 +166,8 @@ class Surroundings:
             variables = near[name] if name in near else read(self._sumo, name)
             if name == ego or variables.get(VEHICLE):
                 continue
-            if name in self.placed or not self._level.is_other(name, variables, long=name in self._nearby.very_long):
+            long, placed_there = name in self._nearby.very_long, name in self.placed
+            if not self._level.is_other(name, variables, long=long, placed=placed_there):
                 self._record(row, parts, before, name, variables)
         for name in self.present:
             if name in self.jumped:

@@ -314,7 +314,8 @@ class UserSimulation:
         """Return SUMO's warnings about the files in the last run of this process, each once, and what is known beside them."""
         lines = (line for line in session().messages() if line.startswith(("Warning:", "Error:")))
         found = dict.fromkeys(line for line in lines if "time=" not in line)  # with a time it is about the traffic
-        of_net = (session().ask(each) for each in (lambda sumo: levels_of(sumo).warning, told_of_junctions, told_of_lengths))
+        levels, moved = (lambda sumo: levels_of(sumo).warning), (one.told for one in self.participants if hasattr(one, "told"))
+        of_net = (session().ask(each) for each in (levels, told_of_junctions, told_of_lengths, *moved))
         return (*filter(None, [unrepeatable(self.files), *of_net]), *found)
 
     def run_with_traci(self, values: Values, seed: int, traci: Any, program: Sequence[str] = ("sumo-gui",)) -> Trace:
