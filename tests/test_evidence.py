@@ -211,16 +211,21 @@ def test_who_stands_beside_a_hill_is_seen_and_asked_nothing_that_ends_the_proces
 
 
 @pytest.mark.sumo
+@pytest.mark.parametrize(("train", "car"), [("other", "ego"), ("ego", "other")])
 @pytest.mark.parametrize(("across", "ended"), [(6.0, "duration"), (0.5, "collision")])
-def test_a_train_is_where_its_body_is_not_on_the_level_of_its_front(simulate, across, ended):
-    """On the bridge with its front down it touched who passed below; on the crossing with its front up it was not there."""
+def test_a_train_is_where_its_body_is_not_on_the_level_of_its_front(simulate, across, ended, train, car):
+    """On the bridge with its front down it touched who passed below; on the crossing with its front up it was not there.
+
+    So it is whichever of the two is the ego, and where heights decide nothing is told to be taken for a bridge.
+    """
     far = 14.0 if across < 1.0 else 0.5
     rail = [(0.0, -300.0, across), (0.0, 20.0, across), (0.0, 120.0, far), (0.0, 400.0, far)]
     bridge = {"over": [(200.0, -50.0, 6.0), (200.0, 50.0, 6.0)], "below": [(150.0, 0.0, 0.0), (250.0, 0.0, 0.0)]}
     roads = {"we": [(-200.0, 0.0, 0.0), (100.0, 0.0, 0.0)], "sn": rail, **bridge}
-    vehicles = vehicle("train", "sn", "rail", departPos=300, departSpeed=12) + vehicle("ego", "we", departPos=10, departSpeed=14)
-    trace = simulate(net(roads, z=True), vehicles, deaf("ego", "train"), duration=18.0)
+    vehicles = vehicle(train, "sn", "rail", departPos=300, departSpeed=12) + vehicle(car, "we", departPos=10, departSpeed=14)
+    trace = simulate(net(roads, z=True), vehicles, deaf("ego", "other"), duration=18.0)
     assert trace.ended == ended
+    assert not any(text.startswith("on another level") for text in trace.unconfirmed)
 
 
 @pytest.mark.sumo

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Collection, Mapping
+from dataclasses import replace
 from typing import Any
 
 from sbt.metrics.heights import LEVEL_HEIGHT
@@ -99,28 +100,36 @@ class EgoLevel:
         Args:
             name: its id.
             variables: of it in this step.
-            long: it is very long: the place that its body covers next to the ego decides.
+            long: it is very long: the place that its body covers next to the ego decides, as that of a very long ego's body.
             placed: it was put there, at this height, which alone decides; not known (NaN): on the ego's level.
         """
-        if self._ground is None and self._apart is None:
+        if not self._several:
             return False
-        if placed:
-            return self._ground is not None and self._is_placed_below(self._ground, name, variables)
+        stretched = self._ego.name in self.trails and self._ego.name not in self._off
+        if self._ground is None and self._apart is None and not stretched:
+            return False
         person, off = VEHICLE in variables, name in self._off
-        place: Place
+        place: Place = variables[POSITION]
+        road = ""
         if off:
-            place, road = self._at_last(name, variables[POSITION])
-        elif long:
-            place, road = self.trails.nearest(name, self._at)
-        else:
-            place, road = variables[POSITION], road_of(self._sumo, name, person=person) if self._apart is not None else ""
-        known = road or not off
-        if known and self._ground is not None and self._ground.is_below(name, place, person=person, off=off):
+            place, road = self._at_last(name, place)
+        elif long and not placed:
+            place, road = self.trails.closest(name, self._ego.name) if stretched else self.trails.nearest(name, self._at)
+        elif not placed and (stretched or self._apart is not None):
+            road = road_of(self._sumo, name, person=person)
+        ground, own_road, apart = self._ground, self._road, self._apart
+        if stretched:
+            at, own_road = self.trails.nearest(self._ego.name, place)
+            ground, apart = None if ground is None else replace(ground, place=at), self._levels.apart.get(own_road)
+        if placed:
+            return ground is not None and self._is_placed_below(ground, name, variables)
+        if (road or not off) and ground is not None and ground.is_below(name, place, person=person, off=off):
             return True
-        if self._apart is None or road not in self._apart:
+        if apart is None or road not in apart:
             return False
-        if (self._road, road) not in self._notes:
-            self._note(road, name, variables, person=person)
+        roads = own_road, road
+        if roads not in self._notes and roads in self._levels.guessed:
+            self._note(roads, name, variables, person=person)
         return True
 
     def _is_placed_below(self, ground: Ground, name: str, variables: Mapping[int, Any]) -> bool:
@@ -131,12 +140,13 @@ class EgoLevel:
         astray = not person and abs(self._sumo.vehicle.getPosition3D(name)[2] - place[2]) >= LEVEL_HEIGHT
         return ground.is_below(name, place, person=person, off=astray or not road_of(self._sumo, name, person=person))
 
-    def _note(self, road: str, name: str, variables: Mapping[int, Any], *, person: bool) -> None:
+    def _note(self, roads: tuple[str, str], name: str, variables: Mapping[int, Any], *, person: bool) -> None:
         if math.dist(self._at[:2], variables[POSITION][:2]) > self._ego.length + _LONGEST:
             return
         state = state_in_sumo(self._sumo.person if person else self._sumo.vehicle, name, person=person)
         found = deepest_overlap(instant(self._ego), {name: instant(state)})
         if found is not None:
-            roads, at = f"'{self._road}' and '{road}'", f"'{name}' at {self._t:.3f} s"
-            why = f"{roads} cross without a junction and are taken for a bridge: heights (z) of nodes decide it"
-            self._notes[self._road, road] = f"{OTHER_LEVEL}{at}: bodies overlap by {found[1]:.2f} m in the plane, but {why}"
+            at = f"'{name}' at {self._t:.3f} s"
+            both = f"'{roads[0]}' and '{roads[1]}'"
+            why = f"{both} cross without a junction and are taken for a bridge: heights (z) of nodes decide it"
+            self._notes[roads] = f"{OTHER_LEVEL}{at}: bodies overlap by {found[1]:.2f} m in the plane, but {why}"

@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from sbt.metrics.heights import DETOUR, LEVEL_HEIGHT, STEEPEST
 from sbt.sumo.levels import is_known, road_of
 
@@ -82,8 +84,18 @@ class Trails:
         return True
 
     def nearest(self, name: str, own: Sequence[float]) -> tuple[Sequence[float], str]:
-        """Return the place (x, y, z) that its body covers next to the ego's, and the road there."""
+        """Return the place (x, y, z) that its body covers next to a place, and the road there."""
         return min(self._passed[name], key=lambda passed: math.dist(passed[1][:2], own[:2]))[1:]
+
+    def closest(self, name: str, other: str) -> tuple[Sequence[float], str]:
+        """Return the place that the body of one covers next to the other's, and the road there."""
+        places, others = (np.array([at[:2] for _, at, _ in self._passed[who]]) for who in (name, other))
+        apart = np.hypot(*(places[:, None] - others[None]).transpose(2, 0, 1)).min(axis=1)
+        return self._passed[name][int(apart.argmin())][1:]
+
+    def __contains__(self, name: str) -> bool:
+        """Return whether somebody's trail is kept."""
+        return name in self._passed
 
 
 def _rise(domain: Any, name: str) -> tuple[float, float]:

@@ -44,12 +44,14 @@ class Levels:
         inferred: crossings (edge, edge, x, y) that only the missing junction tells to be bridges: the network is flat there.
         level: those whose heights differ, but by less than a vehicle: roads that meet there, though SUMO does not know it.
         stacked: whether a road passes above another one, or itself, so that heights tell levels.
+        guessed: pairs of edges that are apart by inferred crossings alone.
     """
 
     apart: Mapping[str, frozenset[str]] = field(default_factory=dict)
     inferred: tuple[tuple[str, str, float, float], ...] = ()
     level: tuple[tuple[str, str, float, float], ...] = ()
     stacked: bool = False
+    guessed: frozenset[tuple[str, str]] = frozenset()
 
     @property
     def several(self) -> bool:
@@ -152,6 +154,7 @@ def _find(sumo: Any) -> Levels:
         return Levels(stacked=stacked)
     network = _Network(roads)
     apart: dict[str, set[str]] = defaultdict(set)
+    guessed, decided = set[tuple[str, str]](), set[tuple[str, str]]()
     inferred, level = [], []
     for i, j, at_i, at_j, x, y in crossings:
         a, b = roads[i], roads[j]
@@ -168,7 +171,9 @@ def _find(sumo: Any) -> Levels:
             if not network.near(one, other):
                 apart[one.edge].add(other.edge)
                 apart[other.edge].add(one.edge)
-    return Levels({edge: frozenset(others) for edge, others in apart.items()}, tuple(inferred), tuple(level), stacked)
+                (guessed if flat else decided).update(((one.edge, other.edge), (other.edge, one.edge)))
+    known = {edge: frozenset(others) for edge, others in apart.items()}
+    return Levels(known, tuple(inferred), tuple(level), stacked, frozenset(guessed - decided))
 
 
 def _stacked(sumo: Any, roads: list[_Road]) -> bool:
