@@ -28,6 +28,7 @@ from sbt.estimators.surrogate import Coordinates, LogProbability
 from sbt.loop.stages import Log
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.cells import MOST_GIVEN, MOST_JOINED
+from sbt.problem.sensitivity import outside
 from sbt.problem.space import ParameterSpace
 from sbt.seeds import stream
 from sbt.store.history import History
@@ -48,8 +49,6 @@ _FAR = 30.0
 """Normal score beyond which there is nothing to propose."""
 _RATIOS = 2**13
 """Draws from the new distribution, which tell how much less of the old one there is."""
-_SCORES = np.linspace(-6.0, 6.0, 4001)
-"""Normal scores of an input where the old distribution must have mass: 2e-9 lies beyond."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,11 +207,10 @@ def _check(log: Log, settings: Settings, space: ParameterSpace) -> None:
             raise InputError(f"a metric must be one that the runs measured ({', '.join(history.metrics)}), but got '{metric}'")
     _check_joined(settings.scenario.space, space)
     for old, new in zip(settings.scenario.space.parameters, space.parameters, strict=True):
-        x = np.arange(len(new.choices), dtype=np.float64) if new.choices else new.from_normal(_SCORES)
-        outside = x[~np.isfinite(old.log_density(x))]
-        if len(outside):
+        x = outside(old, new)
+        if len(x):
             rule = f"input {new.name} must stay where the campaign drew it, in {old.range}"
-            raise InputError(f"{rule}, but is to reach {outside.min():.6g} to {outside.max():.6g}: run a campaign there")
+            raise InputError(f"{rule}, but is to reach {x.min():.6g} to {x.max():.6g}: run a campaign there")
 
 
 def _check_joined(old: ParameterSpace, space: ParameterSpace) -> None:

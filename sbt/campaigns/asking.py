@@ -30,7 +30,8 @@ class Sensitivity:
 
     Attributes:
         input, parameter, value: which, as configured.
-        derivative: dP / d parameter, by the score function.
+        derivative: dP / d parameter, by the score function; None where it is not known: an end of the distribution at which it
+            has a density moves with the parameter, or no draw says anything of it.
         std_error: of the derivative.
         elasticity: relative change of P for a relative change of the parameter; None where P or the parameter is 0.
         change: 10 % of the parameter, or of the standard deviation of the input where the parameter is 0.
@@ -40,8 +41,8 @@ class Sensitivity:
     input: str
     parameter: str
     value: float
-    derivative: float
-    std_error: float
+    derivative: float | None
+    std_error: float | None
     elasticity: float | None
     change: float
     raised: float | None
@@ -136,15 +137,20 @@ def sensitivities(found: Reused) -> tuple[Sensitivity, ...]:
     told = [_sensitivity(found, each, p) for each in space_parameters(found.space)]
 
     def reach(each: Sensitivity) -> float:
+        """Return how much 10 % change; what is not known comes last."""
         ends = [abs(end - p) for end in (each.raised, each.lowered) if end is not None]
-        return max(ends, default=abs(each.derivative) * each.change)
+        return max(ends, default=-1.0 if each.derivative is None else abs(each.derivative) * each.change)
 
     return tuple(sorted(told, key=reach, reverse=True))
 
 
 def _sensitivity(found: Reused, parameter: SpaceParameter, p: float) -> Sensitivity:
-    derivative, std_error = _combined(found, _tilted_batches(found, parameter.score(_points(found))))
-    elasticity = parameter.value / p * derivative if p > 0 and parameter.value != 0.0 else None
+    derivative, std_error = None, None
+    if parameter.smooth:
+        derivative, std_error = _combined(found, _tilted_batches(found, parameter.score(_points(found))))
+    if not std_error:
+        derivative = std_error = None
+    elasticity = parameter.value / p * derivative if derivative is not None and p > 0 and parameter.value != 0.0 else None
     raised, lowered = (_changed(found, parameter, parameter.value + side * parameter.tenth) for side in (1.0, -1.0))
     return Sensitivity(
         parameter.input, parameter.name, parameter.value, derivative, std_error, elasticity, parameter.tenth, raised, lowered
@@ -161,7 +167,7 @@ def _changed(found: Reused, parameter: SpaceParameter, value: float) -> float | 
     if not weight.any() or effective_size(weight) < found.least:
         return None
     p, std_error = _combined(found, batches)
-    return min(p, 1.0) if std_error <= p else None
+    return min(p, 1.0) if 0.0 < std_error <= p else None
 
 
 def _points(found: Reused) -> Points:

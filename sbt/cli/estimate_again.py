@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 __all__ = ["estimate_again", "sensitivity_lines"]
 
+_UNKNOWN = "dP/dvalue -: not known (an end of the distribution at which it has a density moves with the value, or no draw tells)"
+
 
 def estimate_again(
     folder: Folder,
@@ -76,7 +78,9 @@ def sensitivity_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
     table = [head, *(tuple(input_value(row[key]) if key == "value" else _shown(row[key]) for key in keys) for row in rows)]
     widths = [max(len(row[k]) for row in table) for k in range(len(head))]
-    return ["  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in table]
+    lines = ["  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in table]
+    unknown = any(row["derivative"] is None for row in rows)
+    return [*lines, f"  {_UNKNOWN}"] if unknown else lines
 
 
 def _shown(value: Any) -> str:

@@ -129,7 +129,9 @@ def sensitivity_table(rows: Sequence[Sensitivity]) -> Table:
     note = (
         "P is only as right as the distributions. Each line changes one number of them by 10 % (a mean of 0: by 10 % of the "
         "standard deviation), by weights of the same runs; elasticity: relative change of P for a relative change of the "
-        "number; ends of ranges are not in the table. Other distributions: sumo-sbt estimate-again."
+        "number; ends of ranges are not in the table. What the runs do not tell is left out: the derivative where an end of the "
+        "distribution, at which it has a density, moves with the number; P where no draw was made. Other distributions: sumo-sbt "
+        "estimate-again."
     )
     return Table(columns, cells, note)
 

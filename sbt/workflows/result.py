@@ -204,7 +204,7 @@ class Result(Generic[C]):
 
         Returns:
             A row a parameter: input, parameter, value, derivative, std_error, elasticity, change, raised, lowered (P with the
-            parameter larger and smaller by `change`).
+            parameter larger and smaller by `change`). What is not known is None or NaN (`sbt.campaigns.asking.Sensitivity`).
         """
         import pandas as pd
 
