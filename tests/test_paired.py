@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.stats import binom, binomtest
 from typer.testing import CliRunner
 
 from sbt.cli import app
@@ -27,6 +28,54 @@ def test_the_interval_of_the_difference_covers():
         low, high = Pairs(before, after, none, none).difference()
         covered.append(low <= 0.2 * 0.5 + 0.8 * 0.02 - 0.2 <= high)
     assert np.mean(covered) >= 0.95
+
+
+def pairs(new: int, fixed: int, n: int, warm_up: np.ndarray | None = None) -> Pairs:
+    at, none = np.arange(n), np.zeros(n, dtype=bool)
+    return Pairs((at >= new) & (at < new + fixed), at < new, none, none, warm_up)
+
+
+def test_the_verdict_is_that_of_the_exact_test_and_of_the_interval():
+    """Nine new of 1,500 pairs and none fixed were undecided, from -.0005 to .0122."""
+    assert pairs(9, 0, 1500).verdict() == "rose"
+    for new in range(0, 26):
+        for fixed in range(0, 26 - new):
+            found, differ = pairs(new, fixed, 60), new + fixed
+            decided = differ > 0 and binomtest(new, differ).pvalue <= 0.05
+            assert found.verdict() == ("undecided" if not decided else "rose" if new > fixed else "fell")
+            low, high = found.difference()
+            assert low <= (new - fixed) / 60 <= high
+            assert (low >= 0.0, high <= 0.0) == (decided and new > fixed, decided and new < fixed)
+
+
+def test_the_interval_that_agrees_with_the_test_holds_by_enumeration():
+    """Whatever the shares of new and fixed failures: each end misses at most in 2.5 %."""
+    n = 40
+    counts = [(new, fixed) for new in range(n + 1) for fixed in range(n + 1 - new)]
+    x, y = np.array(counts).T
+    low, high = np.array([pairs(*each, n).difference() for each in counts]).T
+    low = np.where((low == 0.0) & (x > y), 1e-12, low)  # 0 itself is excluded
+    for new in (0.01, 0.05, 0.1, 0.2, 0.3, 0.42):
+        for fixed in (0.0, 0.01, 0.05, 0.1, 0.2, 0.3, 0.42):
+            mass = binom.pmf(x, n, new) * binom.pmf(y, n - x, fixed / (1.0 - new))
+            assert mass[low > new - fixed].sum() <= 0.025
+            assert mass[high < new - fixed].sum() <= 0.025
+
+
+def test_no_failed_run_decides():
+    n, rng = 60, stream(3, "failed")
+    for _ in range(100):
+        before, after, lost, gone = (rng.random(n) < share for share in (0.05, 0.25, 0.08, 0.08))
+        told = Pairs(before & ~lost, after & ~gone, lost, gone).verdict()
+        for _ in range(10):
+            filled = [np.where(failed, rng.random(n) < rng.random(), hits) for hits, failed in ((before, lost), (after, gone))]
+            assert told in ("undecided", Pairs(*filled, np.zeros(n, bool), np.zeros(n, bool)).verdict())
+
+
+def test_failures_of_one_warm_up_do_not_decide():
+    warm_up = np.repeat(np.arange(10.0), 20)
+    assert pairs(9, 0, 200, warm_up).verdict() == "undecided"
+    assert pairs(9, 0, 200, np.tile(np.arange(10.0), 20)).verdict() == "rose"
 
 
 def test_failed_runs_widen_it_on_both_sides():

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtri
+from scipy.special import chdtri, stdtrit
 
 from sbt.campaigns.counting import DRAWN, counted_iterations
 from sbt.campaigns.gate import Limits
@@ -20,7 +20,7 @@ from sbt.problem.arrays import Mask, Vector
 from sbt.store.history import History
 from sbt.store.records import optional
 
-__all__ = ["Spread", "clustered_interval", "spread_of_batches", "spread_of_draws", "spread_of_share"]
+__all__ = ["Spread", "clustered_interval", "likelier", "spread_of_batches", "spread_of_draws", "spread_of_share"]
 
 Batches = Sequence[CountedBatch]
 _CHANCE = 0.01
@@ -138,6 +138,29 @@ def clustered_interval(hits: Mask, warm_up: Vector | None = None, confidence: fl
         independent = effective_runs(hits.astype(np.float64), warm_up, confidence) / n
     low, high = binomial.interval(float(hits.sum()) * independent, n * independent, confidence)
     return float(low), float(high)
+
+
+def likelier(one: Mask, other: Mask, warm_up: Vector | None = None, confidence: float = 0.975) -> bool:
+    """Return whether the first of two events that exclude each other is likelier: by the exact test on the runs with either.
+
+    Args:
+        one: (n,) the run has the first event.
+        other: (n,) the run has the second one.
+        warm_up: (n,) that each began with, -1 without one; None: there are none. Runs count for fewer by the spread between them.
+        confidence: of the one-sided test.
+
+    Source:
+        McNemar (1947), doi 10.1007/BF02295996, with exact binomial tails.
+    """
+    n, counts = len(one), np.array([one.sum(), other.sum()], dtype=np.float64)
+    if n and warm_up is not None and (warm_up >= 0).all():
+        terms = (one.astype(np.float64) - other) / n
+        terms -= terms.mean()
+        error = clustered_error(terms, warm_up)
+        if error:
+            few = float(stdtrit(n - 1.0, confidence)) / float(stdtrit(len(np.unique(warm_up)) - 1.0, confidence))
+            counts *= min(float((terms**2).sum()) / error**2 * few**2, 1.0)
+    return bool(binomial.lower(counts[0], counts.sum(), confidence) > 0.5) if counts[0] > 0.0 else False
 
 
 def _spread(cluster: Vector, terms: Vector, failed: Vector | None, apart: float) -> Spread | None:

@@ -82,7 +82,8 @@ def _sentences(result: Mapping[str, Any]) -> list[str]:
     return [
         f"{fixed} {'was' if len(result['fixed']) == 1 else 'were'} fixed, {len(result['new']):,} are new,"
         f" {result['still']:,} runs are critical with both, of {result['pairs']:,} pairs of runs with common draws and seeds.",
-        f"The interval of the change is {of}: only runs with different verdicts tell the egos apart.{lost}", *conditional,
+        f"The interval of the change is {of}: only runs with different verdicts tell the egos apart.{lost}"
+        " They also decide whether P rose or fell (McNemar's test).", *conditional,
     ]
 
 

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from sbt.campaigns.clustering import clustered_interval
+from sbt.campaigns.clustering import clustered_interval, likelier
 from sbt.campaigns.counting import random_draws
 from sbt.campaigns.gate import CONDITION
 from sbt.campaigns.wording import number
@@ -75,19 +75,36 @@ class Pairs:
         """(n,) safe before, critical after."""
         return self.after & ~self.before & ~self.failed_before
 
+    def verdict(self, confidence: float = _CONFIDENCE) -> str:
+        """Return `rose`, `fell` or `undecided`: the exact test on the pairs that differ, a failed run as whatever denies it."""
+        tail = 0.5 * (1.0 + confidence)
+        if likelier(self.new, self._perhaps_fixed, self.warm_up, tail):
+            return "rose"
+        return "fell" if likelier(self.fixed, self._perhaps_new, self.warm_up, tail) else "undecided"
+
     def difference(self, confidence: float = _CONFIDENCE) -> tuple[float, float]:
         """Return an interval of P(critical) after minus before that holds at least with this confidence.
 
         Exact binomial limits of the shares of new and of fixed failures, each with half of the error
         (Bonferroni), those of fewer pairs where they share warm-ups; a failed run counts as whatever is worse for the end in
-        question.
+        question. It ends at 0 where the verdict excludes what lies beyond, which keeps its confidence (by enumeration of the
+        counts: an end misses in at most 1.9 % where .025 is allowed), and holds 0 where that is undecided.
         """
-        perhaps_new = (self.after | self.failed_after) & (~self.before | self.failed_before)
-        perhaps_fixed = (self.before | self.failed_before) & (~self.after | self.failed_after)
-        each = 0.5 * (1.0 + confidence)
+        each, verdict = 0.5 * (1.0 + confidence), self.verdict(confidence)
         new, fixed = (clustered_interval(hits, self.warm_up, each)[0] for hits in (self.new, self.fixed))
-        most_new, most_fixed = (clustered_interval(hits, self.warm_up, each)[1] for hits in (perhaps_new, perhaps_fixed))
-        return new - most_fixed, most_new - fixed
+        most_new, most_fixed = (
+            clustered_interval(hits, self.warm_up, each)[1] for hits in (self._perhaps_new, self._perhaps_fixed)
+        )
+        low, high = new - most_fixed, most_new - fixed
+        return max(low, 0.0) if verdict == "rose" else min(low, 0.0), min(high, 0.0) if verdict == "fell" else max(high, 0.0)
+
+    @property
+    def _perhaps_new(self) -> Mask:
+        return (self.after | self.failed_after) & (~self.before | self.failed_before)
+
+    @property
+    def _perhaps_fixed(self) -> Mask:
+        return (self.before | self.failed_before) & (~self.after | self.failed_after)
 
     def share(self, *, after: bool, confidence: float = _CONFIDENCE) -> Json:
         """Return the critical share with one of the egos and its interval, failed runs as safe below and as critical above."""
@@ -296,7 +313,7 @@ def _result(first: History, second: History, requirement: Any) -> Json:
     return {
         "pairs": len(first), "confidence": _CONFIDENCE, **warmed, "before": before, "after": after,
         "difference": after["probability"] - before["probability"], "low": low, "high": high,
-        "verdict": _verdict(low, high),
+        "verdict": pairs.verdict(),
         "fixed": _listed(first, pairs.fixed), "new": _listed(first, pairs.new),
         "still": int((pairs.before & pairs.after).sum()),
     }  # fmt: skip
