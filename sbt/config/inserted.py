@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
 from pathlib import Path
 
+from sbt.config.recorded import is_number
 from sbt.config.scenario_model import InsertEntry, ScenarioModel
 from sbt.config.source import Key, Problems
 from sbt.errors import did_you_mean
@@ -13,11 +15,19 @@ from sbt.sumo.elements import elements
 from sbt.sumo.files import SumoFiles
 from sbt.sumo.inserting import InsertedVehicle, inserted_file
 from sbt.sumo.nets import Roads, roads
+from sbt.sumo.template import tried
 
 __all__ = ["insertion_file"]
 
 _TYPES = ("DEFAULT_VEHTYPE", "DEFAULT_BIKETYPE", "DEFAULT_TAXITYPE", "DEFAULT_RAILTYPE")
 """Vehicle types that SUMO knows by itself."""
+_WORDS = {
+    "position": ("random", "random_free", "free", "base", "last", "stop", "splitFront"),
+    "speed": ("random", "max", "desired", "speedLimit", "last", "avg"),
+    "lane": ("random", "free", "allowed", "best", "best_prob", "first"),
+    "at": ("triggered", "containerTriggered", "now"),
+}
+"""What SUMO takes for a number of a vehicle's start."""
 _SHOWN = 8
 _STEP, _TOLERANCE = 0.1, 1e-6
 """Step where neither the scenario nor its files have one, and how near a time must be to a step (s)."""
@@ -42,6 +52,7 @@ def insertion_file(model: ScenarioModel, files: SumoFiles, problems: Problems) -
             place = f"{found[1].path.name}:{found[0].place[0]}:{found[0].place[1]}"
             problems.add(path, f"an inserted vehicle must have an id of its own, but '{name}' is in {place} already", at_key=True)
         _check_names(entry, net, types, path, problems)
+        _check_numbers(entry, path, problems)
         _check_time(entry.at, files, model.step_length, (*path, "at"), problems)
     vehicles = {name: _vehicle(name, entry, model, problems) for name, entry in model.insert.items()}
     places = {name: problems.source.located(("insert", name), "").rstrip(": ") for name in vehicles}
@@ -65,12 +76,27 @@ def _vehicle(name: str, entry: InsertEntry, model: ScenarioModel, problems: Prob
     )  # fmt: skip
 
 
+def _check_numbers(entry: InsertEntry, path: Key, problems: Problems) -> None:
+    """Refuse what SUMO takes for no start in any run."""
+    for key, words in _WORDS.items():
+        value = getattr(entry, key)
+        if value is None or value in words:
+            continue
+        time = seconds_of(tried(str(value))) if key == "at" else None
+        number = float(tried(str(value))) if is_number(str(value)) else time
+        if number is None or not math.isfinite(number):
+            rule = f"{key} must be a number, a placeholder, or one of SUMO's words ({', '.join(words)})"
+            problems.add((*path, key), f"{rule}, but got '{value}'")
+        elif number < 0 and key != "position" and "${" not in str(value):
+            problems.add((*path, key), f"{key} must be at least 0, but got {value}")
+
+
 def _check_time(at: float | str | None, files: SumoFiles, step: float | None, path: Key, problems: Problems) -> None:
     """Refuse a time within a step: SUMO would insert the vehicle in a later one, at the place that is meant for this time."""
     begin = seconds_of(files.options.get("begin", "0"))
     time = seconds_of(str(at))
     step = step or files.step_length() or _STEP
-    if time is None or begin is None:  # an input, or none
+    if time is None or begin is None or not math.isfinite(time):  # an input, or none
         return
     if abs(round((time - begin) / step) * step - (time - begin)) > _TOLERANCE:
         problems.add(path, f"a start must be whole steps of {step:g} s after {begin:g} s, but is {time:.10g} s")

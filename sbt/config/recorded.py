@@ -2,22 +2,36 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 from sbt.config.scenario_model import RecordedEntry
+from sbt.errors import InputError
 from sbt.metrics.tracks import read_meta
 from sbt.sumo.recorded import RecordedTraffic, recorded_tracks
 from sbt.sumo.recorded_net import extent, motorway, path_of, write_net
+from sbt.sumo.template import tried
 
-__all__ = ["net_of_recording", "recorded_traffic"]
+__all__ = ["is_number", "net_of_recording", "recorded_traffic"]
+
+
+def is_number(text: str) -> bool:
+    """Return whether a text is a finite number once its placeholders are filled."""
+    try:
+        return math.isfinite(float(tried(text)))
+    except ValueError:
+        return False
 
 
 def recorded_traffic(entry: RecordedEntry, folder: Path) -> RecordedTraffic:
     """Return the traffic of an entry.
 
     Raises:
-        InputError: the recording cannot be read, or one that is left out is not there.
+        InputError: the recording cannot be read, one that is left out is not there, or its beginning is no number.
     """
+    if not is_number(str(entry.begin)):
+        rule = 'begin must be a number (s), or a placeholder such as "${t}"'
+        raise InputError(f"{rule}, but got '{entry.begin}'")
     return RecordedTraffic(_path(entry, folder), str(entry.begin), entry.without, entry.offset)
 
 

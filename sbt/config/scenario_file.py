@@ -14,7 +14,7 @@ from sbt.config.inserted import insertion_file
 from sbt.config.load import located, read_text
 from sbt.config.own_metrics import actors_of, metric_of, metrics_of_several
 from sbt.config.profiles import guided_vehicles, profile_of
-from sbt.config.recorded import net_of_recording, recorded_traffic
+from sbt.config.recorded import is_number, net_of_recording, recorded_traffic
 from sbt.config.scenario_model import EgoEntry, InputEntry, MetricEntry, ScenarioModel, SumoEntry
 from sbt.config.several import combined_requirement
 from sbt.config.source import ConfigError, Key, Problems, SourceMap, must_be_measured, must_be_one_of, read_yaml
@@ -237,7 +237,7 @@ class _Builder:
     def _friction(self, files: SumoFiles | None) -> tuple[Friction, ...]:
         """Return the friction of the roads, where it is given or the network has it."""
         given = self._model.friction
-        if isinstance(given, str) and not given.startswith("${"):
+        if isinstance(given, str) and not (given.startswith("${") and is_number(given)):
             rule = 'friction must be a number, or a placeholder such as "${mu}"'
             self._problems.add(("friction",), f"{rule}, but got '{given}'")
         elif given is not None and not isinstance(given, str) and not 0 < given < math.inf:

@@ -17,10 +17,11 @@ from pathlib import Path
 
 from sbt.errors import InputError
 from sbt.problem.plain import Values
+from sbt.sumo.demand import seconds_of
 from sbt.sumo.formatting import format_number
 from sbt.sumo.outputs import begin_outputs
 from sbt.sumo.places import place_in
-from sbt.sumo.template import Placeholder, Template, Vehicle, fill, placeholders, template
+from sbt.sumo.template import Placeholder, Template, Vehicle, fill, placeholders, template, tried
 
 __all__ = ["FIXED_OPTIONS", "Launch", "SumoFiles", "options_of_command", "options_of_config"]
 
@@ -44,11 +45,15 @@ _OUTPUT = re.compile(
     r"|save-.*|C|(.*-)?log(-file)?|l"
 )
 """Options that make SUMO write files, their details, and their older names (of `sumo --save-template`)."""
+_ENDLESS = re.compile(r"[+-]?(nan|inf|infinity)", re.IGNORECASE)
 _NAME = re.compile(r"[A-Za-z][\w.-]*")
 _LIKE_AN_OPTION = re.compile(r"--?[A-Za-z]")
 _IDS = (".explicit", ".knownveh", "remove-vehicles")
 """How options end whose values are ids, which may begin with a minus; SUMO never takes these for options."""
 _GUI = ("gui-settings-file", "start", "quit-on-end", "delay", "window-size", "window-pos", "tracker-interval", "S", "Q", "d", "g")
+_TIMES = re.compile(r"begin|end|step-length|time-to-teleport(\..*)?|max-depart-delay|route-steps")
+_LONGEST_TIME = 9e15
+"""Options that are times, and the longest one that SUMO counts (s)."""
 _FALSE = ("0", "no", "false", "off", "-", "f")
 _OF_SERVER = ("remote-port", "num-clients", "configuration-file")
 """With these SUMO waits for a client, or reads further options by itself."""
@@ -253,9 +258,27 @@ def _check_value(name: str, value: str, place: str) -> None:
     """
     if _LIKE_AN_OPTION.match(value) and not name.endswith(_IDS):
         raise InputError(f"{place}: the value of {name} must not look like an option, but got '{value}'")
+    shown = tried(value)
+    if "${" in shown:
+        raise InputError(f"{place}: a placeholder in the value of {name} must be closed, but got '{value}'")
+    if _TIMES.fullmatch(name):
+        _check_option_time(name, value, place)
+    elif _ENDLESS.fullmatch(shown.strip()) and not name.endswith(_IDS):
+        raise InputError(f"{place}: {name} must be finite, but got '{value}'")
     if name == "mesosim" and "${" not in value and value.strip().lower() not in _FALSE:
         what = "vehicles of a mesoscopic simulation have no positions to measure"
         raise InputError(f"{place}: mesosim must be false, as {what}, but got '{value}'")
+
+
+def _check_option_time(name: str, value: str, place: str) -> None:
+    """Refuse what SUMO reads as no time, and times that it does not begin, end, or step with."""
+    time, varies = seconds_of(tried(value)), "${" in value
+    if time is None or not abs(time) < _LONGEST_TIME:
+        raise InputError(f"{place}: {name} must be a time (s, or hours:minutes:seconds), but got '{value}'")
+    if name == "step-length" and not varies and round(time * 1000) < 1:
+        raise InputError(f"{place}: step-length must be at least 0.001 s, but got '{value}'")
+    if not varies and time < 0 and (name == "begin" or (name == "end" and time != -1)):
+        raise InputError(f"{place}: {name} must not be negative, but got '{value}'")
 
 
 def _split(value: str) -> list[str]:

@@ -31,7 +31,7 @@ from sbt.problem.plain import Values
 from sbt.sumo.outputs import MARKS, in_signals, names_output, output_names, run_file
 from sbt.sumo.places import made_here, place_in
 
-__all__ = ["Placeholder", "Template", "Vehicle", "fill", "placeholders", "template"]
+__all__ = ["Placeholder", "Template", "Vehicle", "fill", "placeholders", "template", "tried"]
 
 _PLACEHOLDER = re.compile(r"\$\{([^{}]*)\}")
 _ALONE = re.compile(rb"([\w.:-]+)\s*=\s*[\"']\s*$")
@@ -195,6 +195,11 @@ def placeholders(text: str, place: str) -> tuple[Placeholder, ...]:
     alone = _PLACEHOLDER.fullmatch(text.strip()) is not None
     attribute = place.rpartition(": ")[2] if alone else ""
     return tuple(_placeholder(match.group(1), place, attribute) for match in _PLACEHOLDER.finditer(text))
+
+
+def tried(text: str) -> str:
+    """Return a text with 1 for each placeholder: whether it may be a number or a time is known before any run."""
+    return _PLACEHOLDER.sub("1", text)
 
 
 def fill(text: str, values: Values, place: str = "") -> str:
