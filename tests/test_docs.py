@@ -14,12 +14,14 @@ from typing import Any
 import pytest
 import typer
 from doc_blocks import PAGES, ROOT, Block, blocks_of, commands_of, inline_commands
+from pydantic import BaseModel
 from typer.testing import CliRunner
 
 from sbt.cli import app
 from sbt.config.assemble import assemble
 from sbt.config.benchmark import load_benchmark
 from sbt.config.load import load, parse
+from sbt.config.model import Configuration
 from sbt.config.scenario_model import ScenarioModel
 from sbt.config.source import read_yaml
 
@@ -256,3 +258,24 @@ def test_cheap_commands_print_what_the_page_shows(block: Block, tmp_path: Path, 
 def test_links_of_the_documentation_lead_somewhere(page: Path):
     links = re.findall(r"\]\((?!https?:|#|mailto:)([^)#\s]*[./][^)#\s]*)", page.read_text())
     assert [link for link in links if not (page.parent / link).exists()] == []
+
+
+@pytest.mark.parametrize(("page", "model"), [("configuration.md", Configuration), ("tutorials/own_files.md", ScenarioModel)])
+def test_tables_of_keys_have_every_key(page: str, model: type[BaseModel]):
+    rows = re.findall(r"^\| (`.*?) \|", (ROOT / "docs" / page).read_text(), re.MULTILINE)
+    told = {key for row in rows for key in re.findall(r"`(\w+)`", row)}
+    assert set(model.model_fields) - told == set()
+
+
+@pytest.mark.parametrize("name", ["falsification", "estimation", "boundary", "coverage"])
+def test_the_page_tells_the_default_sizes(name: str):
+    """A tenth of the budget, at least 10; of a falsification at most 10, of an estimation at most 15, which are its batches."""
+    page = (ROOT / "docs/configuration.md").read_text()
+    rows = {key: re.search(rf"^\| `{key}` \| (.*?) \|", page, re.MULTILINE)[1] for key in ("initial", "batch")}
+    most = {kind: int(count) for count, kind in re.findall(r"(\d+) in an? (\w+)", rows["initial"])}
+    size = {kind: int(count) for count, kind in re.findall(r"(\d+) in an? (\w+)", rows["batch"])}
+    assert "at least 10" in rows["initial"]
+    for budget in (50, 100, 150, 500, 2000):
+        found = parse(f"campaign: {name}\nscenario: cut_in\nbudget: {budget}\n").config
+        assert found.initial == min(max(10, budget // 10), most.get(name, budget))
+        assert found.batch == size.get(name, found.initial)
