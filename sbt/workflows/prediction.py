@@ -160,7 +160,7 @@ def inputs_from(given: Any, space: ParameterSpace) -> tuple[Points, tuple[str, .
             raise InputError(f"an array of inputs must be (n, {space.dimension}), for {names}, but got {x.shape}")
         return _within(x, space), ()
     head = [str(name) for name in given]
-    where = [_column(name, head) for name in space.names]
+    where = _of_runs(space.names, head) or [_column(name, head) for name in space.names]
     columns = []
     for name, key in zip(space.names, where, strict=True):
         try:
@@ -198,6 +198,12 @@ def _numbers_of(given: Any, space: ParameterSpace) -> Points:
     if rows.shape[-1] != space.dimension:
         return np.empty(rows.shape)
     return np.column_stack([_column_of(rows[:, k], p) for k, p in enumerate(space.parameters)])
+
+
+def _of_runs(names: Sequence[str], head: Sequence[str]) -> list[str]:
+    """Return x.NAME of all inputs where a table, as one of runs, has these: its NAME may be another thing (margin)."""
+    ours = [f"x.{name}" for name in names]
+    return ours if all(head.count(name) == 1 for name in ours) else []
 
 
 def _column(name: str, head: list[str]) -> str:
@@ -293,7 +299,8 @@ def read_inputs(path: Path, space: ParameterSpace) -> tuple[Points, tuple[str, .
     if not lines or not any(lines[0]):
         raise InputError(f"{path}:1: the first line must name the columns, but it is empty")
     head = [name.strip() for name in lines[0]]
-    short = [name.removeprefix("x.") for name in head]
+    ours = _of_runs(space.names, head)
+    short = [name.removeprefix("x.") if not ours or name in ours else "" for name in head]
     doubled = next((name for name in space.names if short.count(name) > 1), None)
     if doubled is not None:
         raise InputError(f"{path}:1: a column must stand once, but '{doubled}' stands {short.count(doubled)} times")
