@@ -13,12 +13,15 @@ from difflib import get_close_matches
 
 __all__ = [
     "RAISED", "InputError", "PluginError", "RunError", "SbtError", "StoreError", "UnwritableError", "described", "did_you_mean",
-    "must_be", "must_take", "naming", "place_of",
+    "must_be", "must_take", "naming", "place_of", "shown",
 ]  # fmt: skip
 
 
 RAISED = (Exception, SystemExit)
 """What somebody's own code may raise and is told of: a `sys.exit()` in it would end the program, maybe with exit code 0."""
+
+_LONG = 60
+"""Characters of a value that messages show."""
 
 
 class SbtError(Exception):
@@ -67,7 +70,20 @@ def must_be(rule: str, value: object, *kinds: type) -> None:
     >>> must_be("a name must be text", "a", str)
     """
     if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
-        raise InputError(f"{rule}, but got {value!r}")
+        raise InputError(f"{rule}, but got {shown(value)}")
+
+
+def shown(value: object) -> str:
+    """Return a value as Python writes it, the middle of a long one left out.
+
+    >>> shown(1.5), shown(10**400)
+    ('1.5', '1000000000000000000000000000000 ... 000000000000000000000000000000 (401 characters)')
+    """
+    try:
+        text = repr(value)
+    except Exception:  # of somebody's own class, or of more digits than Python writes
+        text = f"<{type(value).__name__}>"
+    return text if len(text) <= _LONG else f"{text[: _LONG // 2 + 1]} ... {text[-_LONG // 2 :]} ({len(text):,} characters)"
 
 
 def must_take(rule: str, function: object, n: int) -> None:

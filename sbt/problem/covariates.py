@@ -10,7 +10,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from sbt.errors import RAISED, InputError, SbtError, described
+from sbt.errors import RAISED, InputError, SbtError, described, shown
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.plain import Values, written
 from sbt.problem.scenario import LogicalScenario, Simulate
@@ -131,8 +131,8 @@ def _told(source: DrawsAhead, values: Values, seed: int) -> Mapping[str, float] 
         ) from error
     where = f"at {written(values)}, seed {seed}"
     if found is not None and not isinstance(found, Mapping):
-        raise InputError(f"known_before must return numbers by name, or None, but is {found!r} {where}")
+        raise InputError(f"known_before must return numbers by name, or None, but is {shown(found)} {where}")
     for name, value in (found or {}).items():
         if not isinstance(value, float | Real):
-            raise InputError(f"covariate {name} must be a number, but is {value!r} {where}")
+            raise InputError(f"covariate {name} must be a number, but is {shown(value)} {where}")
     return found

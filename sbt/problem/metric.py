@@ -9,7 +9,7 @@ from numbers import Real
 from typing import Any
 
 from sbt import plugins
-from sbt.errors import InputError, RunError, must_be, must_take
+from sbt.errors import InputError, RunError, must_be, must_take, shown
 from sbt.problem.arrays import FARTHEST, Vector
 from sbt.problem.outcome import Status
 from sbt.problem.trace import Trace
@@ -117,5 +117,5 @@ def as_number(name: str, value: Any) -> float:
     except (TypeError, ValueError, OverflowError):
         number = None
     if number is None:
-        raise RunError(Status.FAILED, f"metric {name} must be one number, but got {value!r}")
+        raise RunError(Status.FAILED, f"metric {name} must be one number, but got {shown(value)}")
     return number
