@@ -7,13 +7,15 @@ folder of a campaign; `RunError` ends one run and becomes a row of the store, ne
 from __future__ import annotations
 
 import inspect
+import shlex
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
+from pathlib import Path
 
 __all__ = [
-    "RAISED", "InputError", "PluginError", "RunError", "SbtError", "StoreError", "UnwritableError", "described", "did_you_mean",
-    "must_be", "must_take", "naming", "place_of", "shown",
+    "RAISED", "InputError", "PluginError", "RunError", "SbtError", "StoreError", "UnwritableError", "command_of", "described",
+    "did_you_mean", "must_be", "must_take", "naming", "place_of", "shown",
 ]  # fmt: skip
 
 
@@ -84,6 +86,15 @@ def shown(value: object) -> str:
     except Exception:  # of somebody's own class, or of more digits than Python writes
         text = f"<{type(value).__name__}>"
     return text if len(text) <= _LONG else f"{text[: _LONG // 2 + 1]} ... {text[-_LONG // 2 :]} ({len(text):,} characters)"
+
+
+def command_of(*words: str | Path) -> str:
+    """Return a command to type; a path that would be taken for an option is written from the working directory.
+
+    >>> command_of("sumo-sbt", "replay", Path("-my runs"), "7")
+    "sumo-sbt replay './-my runs' 7"
+    """
+    return shlex.join(f"./{word}" if isinstance(word, Path) and str(word).startswith("-") else str(word) for word in words)
 
 
 def must_take(rule: str, function: object, n: int) -> None:

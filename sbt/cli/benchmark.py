@@ -52,6 +52,6 @@ def benchmark(
         print(f"{result['done']} of {result['cells']} cells done, {len(result['failed'])} failed")
         print(f"table: {result['table']}, {len(result['figures'])} figures" if result["table"] else f"store: {result['store']}")
         if result["done"] < result["cells"] and not figures_only:
-            next_command("sumo-sbt", "benchmark", str(config))
+            next_command("sumo-sbt", "benchmark", config)
     if result["failed"]:
         raise fail("\n".join(f"{name}: {reason}" for name, reason in result["failed"].items()), Exit.INTERNAL)

@@ -145,7 +145,7 @@ def status(
         return
     print("\n".join(_status_lines(found)))
     if found["state"] == "dead" or (found["state"] == "interrupted" and found["conclusion"] is None):
-        next_command("sumo-sbt", "run", str(folder / "config.resolved.yaml"))
+        next_command("sumo-sbt", "run", folder / "config.resolved.yaml")
 
 
 def _status(folder: Path) -> dict[str, Any]:
@@ -187,7 +187,7 @@ def report(folder: Folder, *, trust: Trust = False) -> None:
 
         path = rebuild_report(with_store(folder, trust=trust), told=lambda note: print(f"warning: {note}", file=sys.stderr))
     print(path)
-    next_command("sumo-sbt", "export", str(folder), "--format", "csv")
+    next_command("sumo-sbt", "export", folder, "--format", "csv")
 
 
 def export(
@@ -208,7 +208,7 @@ def export(
     print(path)
     for limit in limits:
         print(f"note: {limit}", file=sys.stderr)
-    next_command("sumo-sbt", "report", str(folder))
+    next_command("sumo-sbt", "report", folder)
 
 
 def bundle(

@@ -42,4 +42,4 @@ def compare(
         print_json({"cells": [vars(cell) for cell in cells]})
     else:
         print(room.table(cells))
-        next_command("sumo-sbt", "run", str(config))
+        next_command("sumo-sbt", "run", config)

@@ -40,7 +40,7 @@ def compare_ego(
         print("\n".join(_rare_lines(result) if rare else _lines(result)))
         if not rare and (result["new"] or result["fixed"]):
             side, found = ("b", result["new"]) if result["new"] else ("a", result["fixed"])
-            next_command("sumo-sbt", "replay", str(folder / side), str(found[0]["run"]), "--film", "run.gif")
+            next_command("sumo-sbt", "replay", folder / side, str(found[0]["run"]), "--film", "run.gif")
     if fail_if_rose and result["verdict"] == "rose":
         raise fail("the probability of a critical run rose", Exit.CRITICAL)
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+from sbt.errors import command_of
 
 __all__ = ["conclusion_lines", "show_conclusion", "shown"]
 
@@ -154,8 +155,8 @@ def _record(item: Mapping[str, Any]) -> str:
 
 def _next(result: Mapping[str, Any]) -> list[str]:
     """Return the command that shows most: the film of the failure that the sentences name, else of the closest run."""
-    conclusion, folder = result.get("conclusion", {}), shlex.quote(str(result["store"]))
+    conclusion, folder = result.get("conclusion", {}), Path(result["store"])
     modes, run = conclusion.get("failure_modes") or (), result.get("look_at")
     if run is None:
         run = modes[0]["representative"] if modes else (conclusion.get("closest") or {}).get("run")
-    return [] if run is None else [f"next: sumo-sbt replay {folder} {run}"]
+    return [] if run is None else [f"next: {command_of('sumo-sbt', 'replay', folder, str(run))}"]

@@ -7,7 +7,6 @@ import functools
 import json
 import math
 import os
-import shlex
 import signal
 import sys
 import threading
@@ -22,7 +21,7 @@ import typer
 
 from sbt import interruption
 from sbt.cli.progress import ProgressDisplay
-from sbt.errors import InputError, SbtError
+from sbt.errors import InputError, SbtError, command_of
 from sbt.execution.streams import SteadyStream, UnwrittenError, open_missing
 
 __all__ = [
@@ -230,7 +229,7 @@ def _plain(value: Any) -> Any:
     return value if value is None or isinstance(value, bool | int | float | str) else str(value)
 
 
-def next_command(*words: str) -> None:
+def next_command(*words: str | Path) -> None:
     """Print the command to try next, on a terminal only: what reads the output is not asked to run anything."""
     if sys.stdout.isatty():
-        print(f"next: {shlex.join(words)}", flush=True)
+        print(f"next: {command_of(*words)}", flush=True)

@@ -45,7 +45,7 @@ def estimate_again(
         print_json(found.to_dict())
     else:
         print("\n".join(_lines(found)))
-        next_command("sumo-sbt", "report", str(folder))
+        next_command("sumo-sbt", "report", folder)
 
 
 def _interval(text: str) -> tuple[float, float]:

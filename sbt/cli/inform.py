@@ -11,7 +11,7 @@ import typer
 
 from sbt.cli.campaign import with_store
 from sbt.cli.console import Exit, clean_stdout, print_json
-from sbt.errors import InputError
+from sbt.errors import InputError, command_of
 from sbt.plugins import KINDS
 
 if TYPE_CHECKING:
@@ -127,11 +127,11 @@ def _told(folder: Path, found: Diagnosis) -> Iterator[str]:
             yield f"  {what}: {', '.join(map(str, which[:8]))}{more}"
     beside = folder / "config.resolved.yaml"
     if not found.runs and beside.is_file():
-        yield f"  nothing can be saved; the same campaign anew: sumo-sbt run {beside} --store NEW"
+        yield f"  nothing can be saved; the same campaign anew: {command_of('sumo-sbt', 'run', beside, '--store', 'NEW')}"
     elif not found.runs:
         yield "  nothing can be saved: begin a new campaign"
     elif found.configuration or beside.is_file():
         where = "" if found.configuration else f", with the configuration of {beside}"
-        yield f"  save what is whole{where}: sumo-sbt doctor {folder} --save NEW"
+        yield f"  save what is whole{where}: {command_of('sumo-sbt', 'doctor', folder, '--save', 'NEW')}"
     else:
         yield "  nothing can go on without the configuration: begin a new campaign"

@@ -27,4 +27,4 @@ def new(
         written = write_scenario(folder, config, ego)
     for line in (*written.paths, *written.notes):
         print(line)
-    next_command("sumo-sbt", "check", str(written.paths[0]))
+    next_command("sumo-sbt", "check", written.paths[0])

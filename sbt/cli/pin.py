@@ -31,4 +31,4 @@ def pin(
         told = ", ".join(map(str, harmless[:8])) + (f" and {len(harmless) - 8} more" if len(harmless) > 8 else "")
         print(f"no failures: runs {told} violate nothing; the test guards that they do not begin to", file=sys.stderr)
     print(path)
-    next_command("pytest", "-q", str(path))
+    next_command("pytest", "-q", path)

@@ -78,8 +78,8 @@ def replay(
         if judgements:
             print("\n".join(["with a reference driver in the place of ego:", *map(judgement_line, judgements)]))
         if same and outcome.status == "ok" and (gif is None or not record.level):  # a coarse run is no failure to pin
-            film = ["sumo-sbt", "replay", str(folder), str(run), "--film", f"{run}.gif"]
-            next_command(*(film if gif is None else ["sumo-sbt", "pin", str(folder), str(run), "--into", "tests"]))
+            film = ("sumo-sbt", "replay", folder, str(run), "--film", f"{run}.gif")
+            next_command(*(film if gif is None else ("sumo-sbt", "pin", folder, str(run), "--into", "tests")))
     if not same:
         why = told(again.changed) or not_repeated(again.scenario)
         raise fail(f"a replay must equal the stored run, but got {again.differing}{why}", Exit.INTERNAL)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shlex
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import numpy as np
 from sbt.campaigns.asking import Sensitivity
 from sbt.campaigns.estimation import EstimationConclusion
 from sbt.campaigns.wording import NOTHING, number
+from sbt.errors import command_of
 from sbt.files import write_atomically
 from sbt.loop.stages import Conclusion
 from sbt.plugins import OBJECT
@@ -202,10 +202,10 @@ def _commands(found: Findings, store: Store) -> dict[str, str]:
             "export": f"sbt.open({folder!r}).export('csv')",
         }
     return {
-        "run": shlex.join(["sumo-sbt", "run", f"{folder}/config.resolved.yaml", "--store", f"{folder}-again"]),
-        "replay": f"{shlex.join(['sumo-sbt', 'replay', folder])} RUN",
-        "film": f"{shlex.join(['sumo-sbt', 'replay', folder])} RUN --gif RUN.gif",
-        "export": shlex.join(["sumo-sbt", "export", folder, "--format", "csv"]),
+        "run": command_of("sumo-sbt", "run", Path(folder, "config.resolved.yaml"), "--store", Path(f"{folder}-again")),
+        "replay": f"{command_of('sumo-sbt', 'replay', Path(folder))} RUN",
+        "film": f"{command_of('sumo-sbt', 'replay', Path(folder))} RUN --gif RUN.gif",
+        "export": command_of("sumo-sbt", "export", Path(folder), "--format", "csv"),
     }
 
 

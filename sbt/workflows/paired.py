@@ -10,7 +10,6 @@ has the first one's estimate as its gate: a new ego is looked at for what the ol
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +22,7 @@ from sbt.campaigns.counting import random_draws
 from sbt.campaigns.gate import CONDITION
 from sbt.campaigns.wording import number
 from sbt.config.load import load
-from sbt.errors import InputError
+from sbt.errors import InputError, command_of
 from sbt.loop.stages import Progress
 from sbt.problem.arrays import Mask, Vector
 from sbt.problem.plain import Json
@@ -173,7 +172,7 @@ def _page(store: Path, studies: Sequence[Study], histories: Sequence[History], r
         films.append({film.run: film for film in found})
         notes.append(note)
     both = [(kinds[run], films[0][run], films[1][run]) for run in chosen if run in films[0] and run in films[1]]
-    commands = "\n".join(shlex.join(["sumo-sbt", "replay", str(store / name)]) + " RUN --gif RUN.gif" for name in ("a", "b"))
+    commands = "\n".join(command_of("sumo-sbt", "replay", store / name) + " RUN --gif RUN.gif" for name in ("a", "b"))
     title = f"{scenario.name}: {names} on the same draws"
     units, note = {p.name: p.unit for p in scenario.space.parameters}, " ".join(dict.fromkeys(filter(None, notes)))
     return write_versus(store, title, result, both, units=units, commands=commands, note=note)
