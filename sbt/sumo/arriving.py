@@ -97,7 +97,7 @@ def unknown_end(other: str, t: float) -> str:
 def _variables(sumo: Any, near: _Surroundings, name: str) -> Mapping[int, Any] | None:
     """Return the variables of a road user after the step; None where it is gone, too, or rides."""
     if name in near.placed:
-        return placed_variables({name: near.placed[name]}, 0.0)[name]
+        return placed_variables({name: near.placed[name]})[name]
     if not near.is_person(name):
         return read(sumo, name) if is_known(sumo, name) else None
     of = sumo.person
