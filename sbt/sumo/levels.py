@@ -84,12 +84,11 @@ def _named(crossings: Sequence[tuple[str, str, float, float]]) -> str:
 
 def levels_of(sumo: Any) -> Levels:
     """Return the levels of the network that SUMO has loaded; computed once a network and process."""
-    file = Path(sumo.simulation.getOption("net-file"))
     try:
-        state = file.stat()
+        state = Path(sumo.simulation.getOption("net-file")).stat()  # to resolve the path would take ten times as long
     except OSError:  # traci with a SUMO that has another working directory
         return _find(sumo)
-    return _cached(file.resolve(), state.st_mtime_ns, state.st_size, _Client(sumo))
+    return _cached((state.st_dev, state.st_ino, state.st_mtime_ns, state.st_size), _Client(sumo))
 
 
 def is_known(sumo: Any, vehicle: str) -> bool:
@@ -121,7 +120,7 @@ class _Client:
 
 
 @lru_cache(maxsize=8)
-def _cached(file: Path, changed: int, size: int, client: _Client) -> Levels:
+def _cached(file: tuple[int, ...], client: _Client) -> Levels:
     found = _find(client.sumo)
     del client.sumo  # the cache keeps the key
     return found
