@@ -351,6 +351,19 @@ def test_a_gate_does_not_pass_on_a_metamodel_that_was_refuted():
     assert gate_verdict(Limits(lambda _: 0.03, lambda _: 0.05), Gate(0.02), 0.12, 1).verdict == "fail"
 
 
+@pytest.mark.parametrize("allowed", [0.9999, 0.99951, 0.0123456, 1.5e-7])
+@pytest.mark.parametrize(("low", "high"), [(0.5, 0.999999), (0.5, 1 + 1e-6), (1 + 1e-6, 1.00001)])
+def test_a_gate_names_what_was_asked_and_ends_on_their_side_of_it(allowed, low, high):
+    """'At least 0.963 and at most 1: whether it is within 1 is open' was said of 0.9999."""
+    limits = Limits(lambda _: low * allowed, lambda _: high * allowed)
+    statement = gate_verdict(limits, Gate(allowed, 0.9995)).statement
+    assert f" {allowed!r}" in statement
+    assert "with 0.9995 confidence" in statement
+    for words, end in (("at least", low), ("at most", high)):
+        told = [float(each.split()[0].rstrip(":,;")) for each in statement.split(f"{words} ")[1:]]
+        assert all((each > allowed) == (end > 1) and each != allowed for each in told)
+
+
 @pytest.mark.parametrize(("undetected", "told"), [(0.12, True), (0.01, False)])
 def test_a_gate_that_passes_says_what_it_cannot_exclude(undetected, told):
     verdict = gate_verdict(Limits(lambda _: 0.001, lambda _: 0.002), Gate(0.02), undetected)

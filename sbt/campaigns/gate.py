@@ -79,29 +79,37 @@ def gate_verdict(
         cov: coefficient of variation of the estimate; None: there is no estimate, or the limits are exact.
     """
     low, high = limits.lower(gate.confidence), limits.upper(gate.confidence)
-    sure, allowed = f"with {gate.confidence:.3g} confidence", f"{gate.probability:.3g}"
+    sure, allowed = f"with {gate.confidence:.15g} confidence", f"{gate.probability:.15g}"
+    least, most = (_beside(end, gate.probability) for end in (low, high))
     if high <= gate.probability < undetected and surprises:
         were = "draw was" if surprises == 1 else "draws were"
         verdict, statement = "undecided", (
             f"{surprises} {were} critical where the metamodel denied it: by these draws alone such runs may hold up to"
-            f" {undetected:.2g}, and the upper limit of {high:.3g} cannot be relied on; whether it is within {allowed} is open"
+            f" {undetected:.2g}, and the upper limit of {most} cannot be relied on; whether it is within {allowed} is open"
         )
     elif high <= gate.probability < undetected and cov is not None and cov > _KNOWN:
         verdict, statement = "undecided", (
-            f"the estimate has a coefficient of variation of {cov:.2g}, and the upper limit of {high:.3g} cannot be relied on;"
+            f"the estimate has a coefficient of variation of {cov:.2g}, and the upper limit of {most} cannot be relied on;"
             f" whether it is within {allowed} is open"
         )
     elif high <= gate.probability:
-        verdict, statement = "pass", f"{sure} the probability is at most {high:.3g}, within the allowed {allowed}"
+        verdict, statement = "pass", f"{sure} the probability is at most {most}, within the allowed {allowed}"
         if high + undetected > gate.probability:
             unmet = "a critical region that no run has met, or failures that few seeds show, could hold up to"
             more = "" if undetected > gate.probability else " more"
             statement = f"{CONDITION}, {statement}; {unmet} {undetected:.2g}{more}"
     elif low > gate.probability:
-        verdict, statement = "fail", f"{sure} the probability is at least {low:.3g}, above the allowed {allowed}"
+        verdict, statement = "fail", f"{sure} the probability is at least {least}, above the allowed {allowed}"
     else:
-        verdict = "undecided"
-        digits = next((k for k in (3, 4, 5) if gate.probability not in (float(f"{low:.{k}g}"), float(f"{high:.{k}g}"))), 6)
-        ends = f"at least {low:.{digits}g} and at most {high:.{digits}g}"
+        verdict, ends = "undecided", f"at least {least} and at most {most}"
         statement = f"{sure} each the probability is {ends}: whether it is within {allowed} is open"
     return GateVerdict(verdict, gate.probability, gate.confidence, low, high, statement)
+
+
+def _beside(end: float, allowed: float) -> str:
+    """Return an end with as many digits, three at least, as tell on which side of what is allowed it lies."""
+    for digits in range(3, 17):
+        rounded = float(f"{end:.{digits}g}")
+        if end == allowed or (rounded != allowed and (rounded > allowed) == (end > allowed)):
+            break
+    return f"{end:.{digits}g}"
