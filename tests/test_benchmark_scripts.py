@@ -14,6 +14,7 @@ SMALLEST = {
     "boundary.py": "--scenario cut_in --seeds 1 --budget 30 --batch 10 --reference 200",
     "boundary_warm.py": "--seeds 1 --cases waves --budget 20 --earlier 40 --table {folder}/warm.jsonl",
     "corners.py": "ties --seeds 2",
+    "constrained.py": "--seeds 1 --sums 1.224 --budget 40 --table {folder}/constrained.jsonl",
     "contacts.py": "--runs 2 --nets roundabout",
     "cut_in_plane.py": "--size 4 --out {folder}/plane.png",
     "metamodels.py": "--kinds et --rows 20 --inputs 2 --points 64 --repeat 1",

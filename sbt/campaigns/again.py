@@ -16,6 +16,7 @@ from threadpoolctl import threadpool_limits
 from sbt.campaigns.counting import DRAWN, NOMINAL, Seen
 from sbt.campaigns.crude import nominal_rows, took_monte_carlo
 from sbt.campaigns.known import Known
+from sbt.campaigns.pools import Frame, admitted, most_nominal, sample_mixture
 from sbt.campaigns.records import EstimationProposal
 from sbt.campaigns.settings import Settings
 from sbt.campaigns.summing import counted_with, took_sum
@@ -237,15 +238,12 @@ def _predicted(log: Log, settings: Settings, space: ParameterSpace, draws: list[
         if learned is None:
             yield _NOTHING_SAID, _NOTHING_SAID
             continue
-        z, stratum = mixture.sample(_POOL, stream(settings.seed, "again pool", batch.number))
-        x = space.from_normal(z)
-        log_w = log_normal(z) - mixture.log_density(z)
-        if space.constraints:
-            log_w = np.where(space.feasible(x), log_w - np.log(space.feasible_mass), -np.inf)
-        weight = np.exp(log_w) / _POOL
+        frame = Frame(mixture.wide, mixture.choices)
+        at = sample_mixture(space, frame, mixture, _POOL, stream(settings.seed, "again pool", batch.number))
+        x, weight = space.from_normal(at.v), np.exp(at.log_p - at.log_h) / _POOL
         at_draws, at_pool = (events(learned, old.to_normal(points))[0] for points in (history.x[batch.rows], x))
         said = [
-            _Said(np.exp(there[0]), Predicted(x, weight, np.exp(here[0]), stratum))
+            _Said(np.exp(there[0]), Predicted(x, weight, np.exp(here[0]), at.stratum))
             for there, here in ((at_draws.safe, at_pool.safe), (at_draws.critical, at_pool.critical))
             if there is not None and here is not None
         ]  # fmt: skip
@@ -257,20 +255,23 @@ def _mixture(
 ) -> Mixture:
     """Return a proposal for points that the metamodel takes for critical, in proportion to the new distribution."""
     choices = choice_scores(space)
-    blank = Mixture(wide_scales(Coordinates(space).bounded), choices=choices)
+    blank = Mixture(wide_scales(Coordinates(space).bounded), choices=choices, most_nominal=most_nominal(space))
     hits = old.from_normal(known.z[known.critical])
     hits = space.to_normal(hits[np.isfinite(space.log_density(hits))])
     hits = hits[(np.abs(hits) < _FAR).all(axis=1)]
     if not len(hits):
         return blank
 
+    def log_p(z: Points) -> Vector:
+        return admitted(space, z, log_normal(z)) if space.constraints else log_normal(z)
+
     def mass(z: Points) -> Vector:
-        return log_normal(z) + learned(old.to_normal(space.from_normal(z)))[0]
+        return log_p(z) + learned(old.to_normal(space.from_normal(z)))[0]
 
     def failed_critical(z: Points) -> Vector:
         worst = events(learned, old.to_normal(space.from_normal(z)))[0].critical
-        return log_normal(z) if worst is None else log_normal(z) + 0.5 * worst[0]
+        return log_p(z) if worst is None else log_p(z) + 0.5 * worst[0]
 
     targets = (mass, failed_critical) if len(known.failed) else (mass,)
     clouds = tuple(particles(target, Near(blank, hits), _PARTICLES, rng, _CANDIDATES) for target in targets)
-    return fit_mixture(clouds, blank.wide, rng, choices=choices)
+    return replace(fit_mixture(clouds, blank.wide, rng, choices=choices), most_nominal=blank.most_nominal)

@@ -164,7 +164,7 @@ class ManyInputsStage:
         every = np.vstack([v, subspace.reduce(s.scenario.space.to_normal(lost))]) if len(lost) else v
         learned = with_failed_runs(given, unit, every, np.arange(len(every)) < len(v), fit)
         shares = BLIND if not hit.any() or hit.all() else SHARES
-        frame = Frame(wide_scales(np.zeros(v.shape[1])), lift=subspace.lift)
+        frame = Frame(wide_scales(np.zeros(v.shape[1])), lift=subspace.lift, reduce=subspace.reduce)
         return frame, fit_proposal(s.scenario.space, frame, learned, v[hit], shares, rng), shares
 
 

@@ -1,13 +1,15 @@
 """Pools that the draws of an estimation come from: points of a proposal with exact density, and how a batch is drawn from them.
 
-The proposal changes the distribution of all inputs, or of the coordinates of a subspace alone.
+The proposal changes the distribution of all inputs, or of the coordinates of a subspace alone. With constraints its nominal
+component is the inputs' distribution within them, by rejection, and the others are fitted to what is admissible: a point outside
+has no weight, and where little is admissible a pool that knew nothing of it would have next to no points.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -25,7 +27,10 @@ from sbt.problem.arrays import Points, Vector
 from sbt.problem.space import ParameterSpace
 from sbt.store.database import PlannedRun
 
-__all__ = ["SKETCH", "Frame", "Pool", "Proposal", "draw_batch", "draw_pool", "fit_proposal", "planned"]
+__all__ = [
+    "SKETCH", "Frame", "Pool", "Proposal", "Sampled", "admitted", "draw_batch", "draw_pool", "fit_proposal", "most_nominal",
+    "planned", "sample_mixture",
+]  # fmt: skip
 
 # Sizes: larger ones changed the estimates of the testbeds by less than their spread (docs/measured/estimation.md).
 _POOL, _POOL_COST, _POOL_EACH = 10_000, 2e10, 300
@@ -40,6 +45,9 @@ SKETCH = 600
 _REFITS, _REFIT_POINTS, _ENOUGH = 4, 3000, 0.15
 """How often the mixture is fitted again to its own points at most, how many they are, and the effective share of them that is
 enough: of a perfect fit four tenths would be."""
+_TRIES = 30
+"""Draws of the inputs' distribution for a point of a pool at most, of which those within constraints are kept: where a
+three-hundredth is admissible a tenth of the pool can be such points, and less where less is."""
 
 
 def _unchanged(v: Points, rng: np.random.Generator) -> Points:
@@ -55,11 +63,13 @@ class Frame:
         wide: (m,) standard deviations of the wide component.
         choices: the scores of inputs with choices among the coordinates.
         lift: coordinates to normal scores z (n, d) of all inputs.
+        reduce: normal scores of all inputs to coordinates; None: they are the same.
     """
 
     wide: Vector
     choices: tuple[ChoiceScore, ...] = ()
     lift: Callable[[Points, np.random.Generator], Points] = field(default=_unchanged)
+    reduce: Callable[[Points], Points] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,12 +123,17 @@ def fit_proposal(
         shares: of the draws, as `SHARES`.
         rng: the only source of randomness.
     """
-    mixture, drawn = Mixture(frame.wide, choices=frame.choices), None
+    mixture, drawn = Mixture(frame.wide, choices=frame.choices, most_nominal=most_nominal(space)), None
     if log_probability is not None and hits is not None:
-        mixture, drawn = _fitted(log_probability, mixture, hits, rng)
+        mixture, drawn = _fitted(space, frame, log_probability, mixture, hits, rng)
     if drawn is None:
-        drawn = _drawn(mixture, log_probability, _PILOT, rng)
+        drawn = _drawn(space, frame, mixture, log_probability, _PILOT, rng)
     return Proposal(mixture, log_probability, _pooled(space, frame, mixture, drawn, shares, rng).plan)
+
+
+def most_nominal(space: ParameterSpace) -> float:
+    """Return the largest share of a mixture's nominal component whose points are not too dear to find within the constraints."""
+    return min(_TRIES * space.feasible_mass, 1.0)
 
 
 def draw_pool(
@@ -127,27 +142,58 @@ def draw_pool(
 ) -> Pool:  # fmt: skip
     """Return a fresh pool and how a batch would be drawn from it, so many draws; the metamodel `learned` from so many runs."""
     n = int(np.clip(_POOL_COST / max(learned, 1) ** 2, min(_POOL_EACH * draws, _POOL), _POOL))
-    drawn = _drawn(proposal.mixture, proposal.log_probability, n, rng)
+    drawn = _drawn(space, frame, proposal.mixture, proposal.log_probability, n, rng)
     return _pooled(space, frame, proposal.mixture, drawn, shares, rng, proposal.pilot.form)
 
 
 @dataclass(frozen=True, eq=False)
-class _Drawn:
-    """Points of a mixture: coordinates v (n, m), the component each was drawn from, log density, what the metamodel says."""
+class Sampled:
+    """Points of a mixture: coordinates v (n, m), the component each was drawn from, log densities log h and log p of the inputs.
+
+    With constraints also normal scores z (n, d); log p is -inf outside of them.
+    """
 
     v: Points
     stratum: Vector
     log_h: Vector
+    log_p: Vector
+    z: Points | None = None
+
+
+def sample_mixture(space: ParameterSpace, frame: Frame, mixture: Mixture, n: int, rng: np.random.Generator) -> Sampled:
+    """Return n points of a mixture, of which the nominal component is the inputs' distribution within the constraints."""
+    v, stratum = mixture.sample(n, rng)
+    if not space.constraints:
+        return Sampled(v, stratum, mixture.log_density(v), log_normal(v))
+    z, nominal = frame.lift(v, rng), stratum == 0
+    z[nominal] = space.sample_scores(int(nominal.sum()), rng)
+    v = z if frame.reduce is None else frame.reduce(z)
+    log_p = admitted(space, z, log_normal(v))
+    return Sampled(v, stratum, mixture.log_density(v, log_p), log_p, z)
+
+
+@dataclass(frozen=True, eq=False)
+class _Drawn:
+    """Points of a mixture, and what the metamodel says there."""
+
+    at: Sampled
     whole: Event
     parts: tuple[Event, ...]
 
 
-def _drawn(mixture: Mixture, log_probability: LogProbability | None, n: int, rng: np.random.Generator) -> _Drawn:
+def _drawn(
+    space: ParameterSpace, frame: Frame, mixture: Mixture, log_probability: LogProbability | None, n: int,
+    rng: np.random.Generator,
+) -> _Drawn:  # fmt: skip
     """Return n points of a mixture."""
-    v, stratum = mixture.sample(n, rng)
-    unsure = np.full(n, np.log(0.5))
-    whole, parts = (Event((unsure, unsure)), ()) if log_probability is None else events(log_probability, v)
-    return _Drawn(v, stratum, mixture.log_density(v), whole, parts)
+    at, unsure = sample_mixture(space, frame, mixture, n, rng), np.full(n, np.log(0.5))
+    whole, parts = (Event((unsure, unsure)), ()) if log_probability is None else events(log_probability, at.v)
+    return _Drawn(at, whole, parts)
+
+
+def admitted(space: ParameterSpace, z: Points, log_normal_density: Vector) -> Vector:
+    """Return (n,) the log density of the inputs within the constraints, of that without them, at normal scores z (n, d)."""
+    return np.where(space.feasible(space.from_normal(z)), log_normal_density - math.log(space.feasible_mass), -np.inf)
 
 
 def _pooled(
@@ -155,53 +201,58 @@ def _pooled(
     form: str | None = None,
 ) -> Pool:  # fmt: skip
     """Return the pool of the points that were drawn."""
-    v, stratum, log_h, whole, parts = drawn.v, drawn.stratum, drawn.log_h, drawn.whole, drawn.parts
-    z = frame.lift(v, rng)
-    x = space.from_normal(z)
-    log_w = log_normal(v) - log_h
-    if space.constraints:
-        log_w = np.where(space.feasible(x), log_w - math.log(space.feasible_mass), -np.inf)
+    at, whole, parts = drawn.at, drawn.whole, drawn.parts
+    z = frame.lift(at.v, rng) if at.z is None else at.z
+    log_wide_ratio = log_wide(at.v, frame.wide, frame.choices) - at.log_h
     plan = plan_batch(
-        *whole.safe, log_w, log_wide(v, frame.wide, frame.choices) - log_h, stratum, shares, form,
+        *whole.safe, at.log_p - at.log_h, log_wide_ratio, at.stratum, shares, form,
         others=tuple(event for event in (whole.critical, *(part.safe for part in parts)) if event is not None),
     )  # fmt: skip
-    return Pool(mixture, z, x, plan, whole, parts, stratum)
+    return Pool(mixture, z, space.from_normal(z), plan, whole, parts, at.stratum)
 
 
 def _fitted(
-    log_probability: LogProbability, start: Mixture, hits: Points, rng: np.random.Generator
+    space: ParameterSpace, frame: Frame, log_probability: LogProbability, start: Mixture, hits: Points, rng: np.random.Generator
 ) -> tuple[Mixture, _Drawn | None]:
     """Return h, fitted to particles of p pi and of p sqrt(pi (1 - pi)), and of what else is estimated; and points of h, if any.
 
     With many runs a sketch of the metamodel guides the particles; the mixture is then fitted again to points of its own, which
-    the metamodel itself weights.
+    the metamodel itself weights. Whether a point of a subspace is admissible the other coordinates say: there only the points
+    that the mixture is fitted to again are.
     """
     rough = sketch_of(log_probability, SKETCH)
 
     def target(v: Points, k: int) -> Vector:
-        return _targets(v, *events(rough, v))[k]
+        log_p = admitted(space, v, log_normal(v)) if space.constraints and frame.reduce is None else log_normal(v)
+        return _targets(log_p, *events(rough, v))[k]
 
     near = Near(start, hits)
-    count = len(_targets(hits[:1], *events(log_probability, hits[:1])))
+    count = len(_targets(log_normal(hits[:1]), *events(log_probability, hits[:1])))
     clouds = tuple(particles(partial(target, k=k), near, _PARTICLES, rng) for k in range(count))
-    mixture = fit_mixture(clouds, start.wide, rng, choices=start.choices)
+    mixture = _fitted_to(clouds, start, rng)
     for _ in range(_REFITS):  # from particles that a few ancestors share to points that are independent
-        drawn = _drawn(mixture, log_probability, _REFIT_POINTS, rng)
-        targets = _targets(drawn.v, drawn.whole, drawn.parts)
-        if min(effective_size(target - drawn.log_h) for target in targets) >= _ENOUGH * _REFIT_POINTS:
+        drawn = _drawn(space, frame, mixture, log_probability, _REFIT_POINTS, rng)
+        at, targets = drawn.at, _targets(drawn.at.log_p, drawn.whole, drawn.parts)
+        if min(effective_size(target - at.log_h) for target in targets) >= _ENOUGH * _REFIT_POINTS:
             return mixture, drawn
-        clouds = tuple(drawn.v[reweighted(target, drawn.log_h, _PARTICLES, rng)] for target in targets)
-        mixture = fit_mixture(clouds, start.wide, rng, choices=start.choices)
+        clouds = tuple(at.v[reweighted(target, at.log_h, _PARTICLES, rng)] for target in targets)
+        mixture = _fitted_to(clouds, start, rng)
     return mixture, None
 
 
-def _targets(v: Points, whole: Event, parts: tuple[Event, ...]) -> list[Vector]:
-    """Return the log densities that points of a pool should follow, not normalised, at coordinates v (n, m).
+def _fitted_to(clouds: tuple[Points, ...], start: Mixture, rng: np.random.Generator) -> Mixture:
+    """Return the mixture that is fitted to clouds of particles, with the nominal component of another one."""
+    fitted = fit_mixture(clouds, start.wide, rng, choices=start.choices)
+    return replace(fitted, most_nominal=start.most_nominal)
+
+
+def _targets(log_p: Vector, whole: Event, parts: tuple[Event, ...]) -> list[Vector]:
+    """Return the log densities that points of a pool should follow, not normalised, where that of the inputs is log_p (n,).
 
     Those of the event's mass and boundary; where runs failed, between the mass and the boundary of critical or failed ones;
     the mass of each requirement of a combination.
     """
-    log_p, (log_pi, log_not) = log_normal(v), whole.safe
+    log_pi, log_not = whole.safe
     worst = [] if whole.critical is None else [log_p + 0.5 * whole.critical[0]]
     return [log_p + log_pi, log_p + 0.5 * (log_pi + log_not), *worst, *(log_p + part.safe[0] for part in parts)]
 

@@ -68,6 +68,8 @@ _EVEN_SHARE = 0.1
 _BATCHES, _BATCH = 8, 15
 """Least number of batches that a budget is for, and runs that a batch may have anyway. With a single batch that counts a fifth of
 the intervals missed where the metric jumps: it was drawn with what a search alone had learned, and no other one denies it."""
+_EXPECTED = 2000
+"""Draws of the inputs' distribution by which it is judged what the metamodel expects of it."""
 _BEYOND = 1e-9
 """Mass of the inputs' distribution beyond the ball in normal scores that is searched: failures out there do not count."""
 _SEARCH_SHARE = (0.2, 0.1)
@@ -134,6 +136,10 @@ class SequentialStage:
     @cached_property
     def _frame(self) -> Frame:
         return Frame(self._wide, self._choices)
+
+    @cached_property
+    def _admissible(self) -> Points:
+        return self.settings.scenario.space.sample_scores(_EXPECTED, stream(self.settings.seed, "admissible"))
 
     @property
     def _spares_search(self) -> bool:
@@ -207,7 +213,7 @@ class SequentialStage:
             return False
         if any(batch.read(EstimationProposal).counted is not None for batch in log.iterations):
             return False
-        z = stream(s.seed, "noise", log.iteration).standard_normal((2000, len(self._wide)))
+        z = self._nominal("noise", log.iteration)
         pi = np.exp(log_probability(z)[0])
         hits = float(pi.mean()) * (s.budget - len(log.planned))
         known, gain = hits >= _MANY_HITS or len(log.planned) >= _ENOUGH * s.budget, _gain(pi)
@@ -230,7 +236,7 @@ class SequentialStage:
         few = len(log.planned) < max(_TOLD * s.budget, _TOLD_RUNS) or s.transfer is not None or s.prior_runs is not None
         if few or any(batch.read(EstimationProposal).counted is not None for batch in log.iterations):
             return False
-        z = stream(s.seed, "noise", log.iteration).standard_normal((2000, len(self._wide)))
+        z = self._nominal("noise", log.iteration)
         pi = np.exp(log_probability(z)[0])
         if _gain(pi) >= 1.0 or float(pi.mean()) > _MET_ANYWAY:
             return False
@@ -283,8 +289,14 @@ class SequentialStage:
 
     def _common(self, log_probability: LogProbability | None, iteration: int) -> bool:
         """Return whether the metamodel takes more than 1 in 50 draws from the inputs' distribution to be critical."""
-        z = stream(self.settings.seed, "common", iteration).standard_normal((2000, len(self._wide)))
+        z = self._nominal("common", iteration)
         return log_probability is not None and float(np.exp(sketch_of(log_probability, SKETCH)(z)[0]).mean()) > _COMMON
+
+    def _nominal(self, purpose: str, iteration: int) -> Points:
+        """Return the scores of draws from the inputs' distribution; with constraints always the same, as they are dear."""
+        if self.settings.scenario.space.constraints:
+            return self._admissible
+        return stream(self.settings.seed, purpose, iteration).standard_normal((_EXPECTED, len(self._wide)))
 
     def _search_modes(self, known: Known, log: Log, n: int) -> Points:
         """Return n search picks (n, d): the falsification portfolio in the cube of the wide distribution, some spread evenly."""

@@ -84,30 +84,37 @@ class Mixture:
         defence: shares of the nominal and of the wide component where there are fitted ones (defensive mixture:
             Hesterberg 1995); they bound the weights p/h by 10.
         choices: the scores of inputs with choices; the wide component takes them for equally likely.
+        most_nominal: largest share of the nominal component; smaller where its points are dear, as within constraints.
     """
 
     wide: Vector
     normals: Normals | None = None
     defence: tuple[float, float] = (0.1, 0.1)
     choices: tuple[ChoiceScore, ...] = ()
+    most_nominal: float = 1.0
 
     @property
     def shares(self) -> Vector:
         """(2 + k,) shares of the nominal, the wide and the fitted components."""
         if self.normals is None:
-            return np.array([0.5, 0.5])
-        rest = 1.0 - sum(self.defence)
-        return np.concatenate([self.defence, rest * self.normals.weight])
+            nominal = min(0.5, self.most_nominal)
+            return np.array([nominal, 1.0 - nominal])
+        return np.concatenate([self._defence, (1.0 - sum(self._defence)) * self.normals.weight])
 
-    def log_density(self, z: Points) -> Vector:
-        """Return (n,) log h(z), exact."""
+    @property
+    def _defence(self) -> tuple[float, float]:
+        return min(self.defence[0], self.most_nominal), self.defence[1]
+
+    def log_density(self, z: Points, log_nominal: Vector | None = None) -> Vector:
+        """Return (n,) log h(z), exact; with a nominal component of another log density (n,), such as that within constraints."""
         shares = self.shares
-        terms = [math.log(shares[0]) + log_normal(z), math.log(shares[1]) + log_wide(z, self.wide, self.choices)]
+        log_nominal = log_normal(z) if log_nominal is None else log_nominal
+        terms = [math.log(shares[0]) + log_nominal, math.log(shares[1]) + log_wide(z, self.wide, self.choices)]
         if self.normals is not None:
             fitted = self.normals.log_terms(_ordered(z, self.choices))
             for choice, masses in zip(self.choices, self.normals.masses, strict=True):
                 fitted = fitted + choice.log_ratio(masses, z) + log_normal(z[:, [choice.column]])
-            terms += list(math.log(1.0 - sum(self.defence)) + fitted)
+            terms += list(math.log(1.0 - sum(self._defence)) + fitted)
         return np.asarray(logsumexp(np.array(terms), axis=0))
 
     def sample(self, n: int, rng: np.random.Generator) -> tuple[Points, Vector]:

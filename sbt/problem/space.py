@@ -24,6 +24,7 @@ Formula = Callable[[Mapping[str, Any]], Any]
 _MASS_POINTS, _MOST_MASS_POINTS = 2**15, 2**22
 _ADMISSIBLE = 20_000  # points that a mass is told by: its error is below 1 %
 _MIN_FEASIBLE = 1e-3
+_SCORES_LEAST, _SCORES_MOST = 64, 2**17  # candidates of which admissible scores are kept, at once
 _FAR_SCORES, _TOLD = np.arange(5.0, 38.01, 0.05), 0.5
 """Normal scores up to that from which on float64 knows no probability, and by how much a value may miss its own."""
 
@@ -297,6 +298,16 @@ class ParameterSpace:
             kept.append(x)
             missing -= len(x)
         return np.vstack(kept) if kept else np.empty((0, self.dimension))
+
+    def sample_scores(self, n: int, rng: np.random.Generator) -> Points:
+        """Return (n, d) independent standard-normal scores of values drawn from the distribution, constraints included."""
+        kept: list[Points] = []
+        missing = n
+        while self.constraints and missing > 0:
+            z = rng.standard_normal((int(min(missing / self.feasible_mass + _SCORES_LEAST, _SCORES_MOST)), self.dimension))
+            kept.append(z[self.feasible(self.from_normal(z))][:missing])
+            missing -= len(kept[-1])
+        return np.concatenate(kept) if kept else rng.standard_normal((n, self.dimension))
 
     def metamodel_inputs(self, u: Points) -> Points:
         """Return (n, e + f) columns for a metamodel: the embedded point (see `Cube`) and the derived features in [0, 1].
