@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,12 +11,15 @@ from scipy.special import ndtr
 from scipy.stats import norm
 
 import sbt
+from sbt.campaigns import pools
 from sbt.campaigns.pools import Frame, draw_batch, draw_pool, fit_proposal
+from sbt.campaigns.records import EstimationProposal
 from sbt.estimators.importance import SHARES
 from sbt.estimators.intervals import CountedBatch
 from sbt.estimators.mixture import wide_scales
 from sbt.estimators.subspace import Subspace
 from sbt.seeds import stream
+from sbt.store.database import Store
 
 LARGEST, EDGE = 0.2, 0.11
 TRUTH = ((LARGEST - EDGE) / LARGEST) ** 3
@@ -105,3 +109,29 @@ def test_scores_within_constraints_follow_the_inputs_distribution():
     free = sbt.ParameterSpace(space.parameters)
     same = free.sample_scores(5, stream(6, "scores")), stream(6, "scores").standard_normal((5, 3))
     assert np.array_equal(*same)
+
+
+def scenario() -> sbt.Scenario:
+    return sbt.Scenario(
+        "corner", simplex(0.3), sbt.Requirement("y", high=0.0), metrics=["y"], evaluate=lambda v, seed: {"y": 0.165 - v["c"]}
+    )
+
+
+def test_what_no_run_has_met_is_bounded_by_different_draws(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A point of a pool that was drawn four times is one draw: the bound of 59 draws was stated of 34."""
+    monkeypatch.setattr(pools, "_TRIES", 1e-2, raising=False)  # few admissible points in a pool
+    result = sbt.run(
+        campaign="estimation", scenario=scenario(), budget=60, seed=1, executor="serial", store=tmp_path / "s", report=False,
+        stop={"cov": None},
+    )  # fmt: skip
+    assert result.conclusion.low <= 0.45**3 <= result.conclusion.high
+    runs, different, every = result.history, 0, 0
+    with Store.read(tmp_path / "s") as store:
+        for batch in store.iterations():
+            nominal = batch.read(EstimationProposal).nominal
+            if nominal is not None:
+                drawn = np.isin(runs.stage, ("estimation", "learn")) & (runs.iteration == batch.number)
+                x = runs.x[drawn][: len(nominal.pi)]
+                different, every = different + len(np.unique(x, axis=0)), every + len(x)
+    assert result.conclusion.undetected_mass_bound == pytest.approx(1.0 - 0.05 ** (1.0 / different))
+    assert different < every, "else it tells nothing"

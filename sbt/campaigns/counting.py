@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sbt.campaigns.gate import Limits
 from sbt.campaigns.records import CountedDraws, EstimationProposal, EventDraws, PoolSummary
@@ -15,9 +16,10 @@ from sbt.errors import InputError
 from sbt.estimators import binomial
 from sbt.estimators.intervals import CountedBatch
 from sbt.loop.stages import Log
-from sbt.problem.arrays import Mask, Vector
+from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.combination import CombinedRequirement
 from sbt.problem.requirement import Requirement
+from sbt.problem.space import ParameterSpace
 from sbt.store.history import History
 from sbt.store.records import Iteration
 
@@ -123,7 +125,7 @@ class Seen:
     Attributes:
         critical, safe: runs of any kind.
         draws: in proportion to the inputs' distribution, those that only teach among them: independent of each other, with
-            any metamodel.
+            any metamodel. With constraints a point of a pool that was drawn again is none: it is not another one.
         hits: critical ones of these draws.
         failed: failed ones of these draws.
         surprises: critical ones of these draws to which the metamodel gave next to no probability.
@@ -153,8 +155,10 @@ class Seen:
             nominal = proposal.nominal
             if nominal is not None:
                 first = np.flatnonzero(drawn & (history.iteration == batch.number))[: len(nominal.pi)]
+                own = _different(settings.scenario.space, history.x[first])
+                first = first[own]
                 rows.append(first)
-                surprising.append(np.array(nominal.pi)[: len(first)] < _denied(proposal))
+                surprising.append(np.array(nominal.pi)[own] < _denied(proposal))
                 surprised = batch.number if (critical[first] & surprising[-1]).any() else surprised
         mine, denied = np.concatenate(rows), np.concatenate(surprising)
         return cls(
@@ -175,6 +179,16 @@ class Seen:
     def limits(self) -> Limits:
         """The exact limits of that probability by these draws alone, failed ones as safe below and as critical above."""
         return Limits(lambda confidence: 1.0 - self.most(self.draws - self.hits, confidence), self.most_critical)
+
+
+def _different(space: ParameterSpace, x: Points) -> NDArray[np.intp]:
+    """Return the rows of draws x (n, d) from a pool without those of a point of it that was drawn before.
+
+    Where little is admissible a pool may have few points of weight. Inputs that are all discrete do not tell points apart.
+    """
+    if not space.constraints or all(p.discrete for p in space.parameters):
+        return np.arange(len(x))
+    return np.sort(np.unique(x, axis=0, return_index=True)[1])
 
 
 def _known(requirement: Requirement, history: History) -> int:

@@ -51,7 +51,9 @@ _LIKE_AN_OPTION = re.compile(r"--?[A-Za-z]")
 _IDS = (".explicit", ".knownveh", "remove-vehicles")
 """How options end whose values are ids, which may begin with a minus; SUMO never takes these for options."""
 _GUI = ("gui-settings-file", "start", "quit-on-end", "delay", "window-size", "window-pos", "tracker-interval", "S", "Q", "d", "g")
-_TIMES = re.compile(r"begin|end|step-length|time-to-teleport(\.(highways|disconnected|bidi|ride|railsignal-deadlock))?|max-depart-delay|route-steps")
+_TIMES = re.compile(
+    r"begin|end|step-length|max-depart-delay|route-steps|time-to-teleport(\.(highways|disconnected|bidi|ride|railsignal-deadlock))?"
+)
 _LONGEST_TIME = 9e15
 """Options that are times, and the longest one that SUMO counts (s)."""
 _FALSE = ("0", "no", "false", "off", "-", "f")
