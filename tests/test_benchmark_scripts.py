@@ -12,6 +12,7 @@ from browser import PROGRAM
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 SMALLEST = {
     "boundary.py": "--scenario cut_in --seeds 1 --budget 30 --batch 10 --reference 200",
+    "boundary_traffic.py": "crossing_pedestrian --points 4 --runs 2 --budget 45 --seeds 1 --into {folder}/counts",
     "boundary_warm.py": "--seeds 1 --cases waves --budget 20 --earlier 40 --table {folder}/warm.jsonl",
     "corners.py": "ties --seeds 2",
     "constrained.py": "--seeds 1 --sums 1.224 --budget 40 --table {folder}/constrained.jsonl",
@@ -60,7 +61,7 @@ SMALLEST = {
     "fidelity.py": "problems --budget 40 --seeds 1 --only useless --probabilities 0.38",
     "falsification.py": "--only cut_in_near_miss --samplers portfolio --seeds 2 --into {folder}/into",
 }
-SUMO = {"boundary.py", "contacts.py", "cut_in_plane.py", "overhead.py", "slice_teeth.py", "step_length.py"}
+SUMO = {"boundary.py", "boundary_traffic.py", "contacts.py", "cut_in_plane.py", "overhead.py", "slice_teeth.py", "step_length.py"}
 SUMO |= {"fuzz.py", "noise.py", "pairs.py", "physics.py", "run_price.py", "throughput.py", "transfer.py", "watcher.py"}
 SUMO |= {"pair_estimates.py", "report_speed.py"}  # and Chromium, as serve_speed.py
 LONG = {"batch_size.py", "benchmark_page.py", "known_before.py", "snapshots.py"}  # hours, or minutes

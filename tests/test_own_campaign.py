@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -80,6 +81,22 @@ def test_runs_that_are_none_of_the_scenario_are_refused(inputs, said, tmp_path):
 def test_what_is_no_conclusion_is_refused(conclude, said, tmp_path):
     with pytest.raises(sbt.SbtError, match=said):
         run(tmp_path, Mine([GOOD]), conclude)
+
+
+@pytest.mark.parametrize(("value", "said"), [
+    (np.int64(3), r"found.n is np.int64\(3\) \(int64\)"), ([1, math.nan], r"found.n\[1\] is nan \(float\)"),
+    ({1: 2}, r"a key of found.n is 1 \(int\)"),
+])  # fmt: skip
+def test_what_a_store_cannot_hold_of_a_conclusion_is_told_with_its_place(value, said, tmp_path):
+    class Found:
+        def to_dict(self):
+            return {"found": {"n": value}}
+
+        def sentences(self, facts):
+            return []
+
+    with pytest.raises(sbt.InputError, match=rf"to_dict\(\) of a conclusion must return .* but {said}"):
+        run(tmp_path, Mine([GOOD]), lambda log: (Found(), None))
 
 
 def test_a_recipe_that_raises_is_named(tmp_path):

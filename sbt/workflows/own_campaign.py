@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -99,6 +100,25 @@ def _concluding(conclude: Callable[[Log], Any]) -> Callable[[Log], Any]:
             raise InputError(f"{rule}, but returned {found!r}")
         if not all(hasattr(found[0], name) for name in ("to_dict", "sentences")):
             raise InputError(f"{rule}, but returned the conclusion {found[0]!r}")
+        rule = "to_dict() of a conclusion must return plain values by name (text, finite numbers, true, false, None, lists)"
+        with naming(rule):
+            told = found[0].to_dict()
+        must_be(rule, told, dict)
+        wrong = next(_not_plain(told), None)
+        if wrong is not None:
+            raise InputError(f"{rule}, but {wrong[0]} is {wrong[1]!r} ({type(wrong[1]).__name__})")
         return found
 
     return concluded
+
+
+def _not_plain(value: Any, place: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the places of what JSON cannot hold, and what is there."""
+    if isinstance(value, dict):
+        for key, each in value.items():
+            yield from _not_plain(each, f"{place}.{key}".lstrip(".")) if isinstance(key, str) else [(f"a key of {place}", key)]
+    elif isinstance(value, list | tuple):
+        for k, each in enumerate(value):
+            yield from _not_plain(each, f"{place}[{k}]")
+    elif not (value is None or isinstance(value, str | int) or (isinstance(value, float) and math.isfinite(value))):
+        yield place, value
