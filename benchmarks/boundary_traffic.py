@@ -80,6 +80,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*")
     parser.add_argument("--problems", action="store_true", help="those with an exact P")
+    parser.add_argument("--only", nargs="+", choices=PROBLEMS, default=list(PROBLEMS), help="of these")
+    parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
     parser.add_argument("--points", type=int, default=96)
     parser.add_argument("--runs", type=int, default=100, help="at each point")
     parser.add_argument("--budget", type=int, default=300)
@@ -92,7 +94,7 @@ def main() -> None:
         x, critical = counted(name, given.points, given.runs, given.into)
         rate = critical.mean(axis=1)
         cases[name] = name, x, rate, rate * (1.0 - rate) / (given.runs - 1)
-    for name, problem in PROBLEMS.items() if given.problems else ():
+    for name, problem in ((name, PROBLEMS[name]) for name in given.only if given.problems):
         inputs = [sbt.Parameter("x", -1, 1)]
         scenario = sbt.Scenario("pairs", inputs, sbt.Requirement("y", high=0.0), evaluate=problem, metric_names=("y",))
         x = np.linspace(-0.99, 0.99, 100)[:, None]
@@ -100,8 +102,8 @@ def main() -> None:
         cases[name] = scenario, x, rate, np.zeros(len(rate))
     print("| problem | P | method | error | log loss | mean P / true | critical runs | chosen seeds |\n" + "|---" * 8 + "|")
     for name, (scenario, x, rate, doubt) in cases.items():
-        for method, covariates in METHODS.items() if given.seeds else ():
-            rows = []
+        for method in given.methods if given.seeds else ():
+            covariates, rows = METHODS[method], []
             for seed in range(given.seeds):
                 p, critical, chosen = campaign(scenario, x, given.budget, seed, covariates)
                 rows.append((*compared(p, rate, doubt), critical, chosen))

@@ -79,9 +79,10 @@ def traffic_doubt(settings: Settings, history: History) -> TrafficDoubt | None:
     critical = scenario.requirement.critical_runs(runs)
     if covariates is None or len(runs) < _FEWEST or min(critical.sum(), (~critical).sum()) < _EITHER:
         return None
-    drawn = DrawnTraffic(scenario, settings.seed, covariates) if settings.learner is None else settings.learner.traffic
-    learned = None if drawn is None else drawn.learned(history)
-    if drawn is None or learned is None:
+    drawn = None if settings.learner is None else settings.learner.traffic
+    drawn = DrawnTraffic(scenario, settings.seed, covariates) if drawn is None else drawn
+    learned = drawn.learned(history)
+    if learned is None:
         return None
     p = drawn.table(learned.risk)
     traffic, rest = float(p.var(axis=1, ddof=1).mean()), float((p * (1.0 - p)).mean())

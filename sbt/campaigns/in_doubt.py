@@ -33,7 +33,7 @@ def pairs_in_doubt(settings: Settings, fitted: FittedMetamodel | None, log: Log,
     """Return runs of chosen pairs for a batch of n, about half of it; none where seeds are not looked at, or tell nothing.
 
     A pair is drawn from fresh ones in proportion to the standard deviation of "critical or not" as learned from inputs and
-    covariates. The critical runs that this needs are searched for first.
+    covariates. The critical runs that this needs are searched for first, where traffic promises to tell of them.
 
     Args:
         settings: of the campaign.
@@ -46,12 +46,13 @@ def pairs_in_doubt(settings: Settings, fitted: FittedMetamodel | None, log: Log,
     wanted = int(_SHARE * n)
     if traffic is None or traffic.covariates is None or wanted == 0 or few(settings.scenario, log.planned, settings.budget):
         return []
-    if settings.scenario.requirement.critical_runs(log.history).sum() < _ENOUGH:
+    learned = traffic.learned(log.history)
+    few_critical = settings.scenario.requirement.critical_runs(log.history).sum() < _ENOUGH
+    if learned is None or not (learned.promises if few_critical else learned.tells):
+        return []
+    if few_critical:
         u, seeds = _searched(settings, traffic, log, wanted)
     else:
-        learned = traffic.learned(log.history)
-        if learned is None or not learned.tells:
-            return []
         u, seeds = _drawn(settings, traffic, learned, fitted, log, wanted)
     space = settings.scenario.space
     return [PlannedRun(stage, space.named(x), seed=int(k)) for x, k in zip(space.from_unit(u), seeds, strict=True)]

@@ -195,7 +195,7 @@ def _both_sides_known(log: Log, scenario: LogicalScenario, target: float) -> boo
     """Return whether several runs tell of each side, or those that fill space bound what is missing by so much of it."""
     even, facts = log.history.where(space_filling(log)), Facts.of(log.history, scenario)
     bounded = (none_critical(facts) or all_critical(facts)) and bool(upper(0, len(even), _SURE) <= target)
-    return bounded or not few_of_a_side(facts)
+    return bounded or not few_of_a_side(facts, pairs=bool(log.fits and log.fits[-1].over_traffic))
 
 
 def held_out_runs(settings: Settings, iteration: int, n: int) -> list[PlannedRun]:

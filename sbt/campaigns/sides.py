@@ -6,15 +6,20 @@ import numpy as np
 
 from sbt.campaigns.wording import plural
 from sbt.loop.stages import Facts
+from sbt.store.history import VALIDATION
 
 __all__ = ["all_critical", "few_of_a_side", "met", "none_critical", "safe_runs"]
 
 _FEW = 5  # runs of a side, below which edges are told with reserve, however sure the metamodel is
 
 
-def few_of_a_side(facts: Facts) -> str:
-    """Return in words that the boundary rests on few different inputs of one of its sides; empty where it does not."""
-    training = facts.history.training
+def few_of_a_side(facts: Facts, *, pairs: bool = False) -> str:
+    """Return in words that the boundary rests on few different inputs of one of its sides; empty where it does not.
+
+    `pairs`: P(critical) was learned from runs of chosen seeds, too.
+    """
+    history = facts.history
+    training = history.where(history.ok & (history.stage != VALIDATION)) if pairs else history.training
     critical = facts.requirement.critical_runs(training)
     sides = {name: len(np.unique(training.x[rows], axis=0)) for name, rows in (("critical", critical), ("uncritical", ~critical))}
     side = min(sides, key=lambda name: sides[name])

@@ -29,7 +29,7 @@ def where_critical(found: BoundaryConclusion, facts: Facts) -> tuple[str, str]:
         return f"Every run{of} was critical ({condition}), and {known}", ""
     if found.chance_place is not None:
         return found.chance_place.words(here, condition, facts.units, input_widths(facts.history)), ""
-    few = few_of_a_side(facts)
+    few = few_of_a_side(facts, pairs=found.over_traffic is not None)
     where, lines = ("", "") if found.place is None else _where(found, facts, few)
     if not where:
         return nowhere_likely(found, of, condition, few), ""

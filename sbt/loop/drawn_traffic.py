@@ -13,7 +13,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from sbt.metamodels.risk import Risk, fit_risk_scored
-from sbt.problem.arrays import Mask, Points, Vector
+from sbt.problem.arrays import Points, Vector
 from sbt.problem.covariates import Covariates
 from sbt.problem.plain import JsonMapping
 from sbt.problem.scenario import LogicalScenario
@@ -30,8 +30,10 @@ _POINTS, _SEEDS = 512, 16
 """Points of the space, and fresh seeds at each, over which P is averaged."""
 _FEWEST, _FEWEST_CRITICAL = 40, 3
 """Runs that teach, and critical ones among them, from which on P is taken from pairs."""
-_SURELY = 2.0
-"""Standard errors by which the traffic makes left-out runs likelier, from which on it counts."""
+_FEWEST_POINTS = 16
+"""Feasible points of the space."""
+_SURELY, _PROMISING = 2.0, 0.5
+"""Standard errors by which the traffic makes left-out runs likelier, from which on it counts, or pairs are searched by it."""
 _STEPS = 2**16 - 1
 
 
@@ -41,11 +43,13 @@ class PairRisk:
 
     Attributes:
         risk: (n, c) `DrawnTraffic.inputs` to P(critical).
-        tells: left-out runs are surely likelier by it than by their inputs alone.
+        tells: left-out runs are surely likelier by it than by their inputs alone, and some of each side are known.
+        promises: left-out runs, or of few critical ones the nearest to them, are rather likelier by it.
     """
 
     risk: Risk
     tells: bool
+    promises: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,9 +73,10 @@ class DrawnTraffic:
     def of(
         cls, scenario: LogicalScenario, seed: int, covariates: Covariates | None, kept: JsonMapping
     ) -> DrawnTraffic | None:
-        """Return it with what is kept of a store that is read; None where seeds are not looked at."""
+        """Return it with what is kept of a store that is read; None where seeds are not looked at, or for a combination."""
         told = kept.get(OVER_TRAFFIC)
-        return None if covariates is None and told is None else cls(scenario, seed, covariates, told)
+        nothing = (covariates is None and told is None) or scenario.requirement.combined
+        return None if nothing else cls(scenario, seed, covariates, told)
 
     @cached_property
     def points(self) -> Points:
@@ -93,19 +98,18 @@ class DrawnTraffic:
             return np.exp(risk(self._fresh)[0]).reshape(len(self.points), _SEEDS)
 
     def learned(self, history: History) -> PairRisk | None:
-        """Return what all runs but held-out ones teach of pairs; None where they are too few, or too few of them critical."""
+        """Return what all runs but held-out ones teach of pairs; None where they are too few, or hardly a point is feasible."""
         runs = history.where(history.ok & (history.stage != VALIDATION) & (history.columns["level"] == 0))
-        requirement = self.scenario.requirement
-        critical = requirement.critical_runs(runs)
-        if self.covariates is None or len(runs) < _FEWEST or min(critical.sum(), (~critical).sum()) < _FEWEST_CRITICAL:
+        if self.covariates is None or len(runs) < _FEWEST or len(self.points) < _FEWEST_POINTS:
             return None
         key = runs.index.tobytes()
         if key not in self._newest:
             self._newest.clear()
-            self._newest[key] = self._fitted(runs, critical)
+            self._newest[key] = self._fitted(runs)
         return self._newest[key]
 
-    def _fitted(self, runs: History, critical: Mask) -> PairRisk:
+    def _fitted(self, runs: History) -> PairRisk:
+        critical = self.scenario.requirement.critical_runs(runs)
         margin = np.nan_to_num(self.scenario.requirement.margins(runs), nan=np.inf, posinf=np.inf)
         known, near = self.inputs(runs.x, runs.seed.tolist(), keep=True), scores(margin)
         alone = self.scenario.space.metamodel_inputs_at(runs.x)
@@ -113,8 +117,9 @@ class DrawnTraffic:
             (risk, with_traffic), (_, without) = (
                 fit_risk_scored(rows, near, margin, critical, stream(self.seed, "traffic", len(runs))) for rows in (known, alone)
             )
-        gain = with_traffic - without
-        return PairRisk(risk, bool(gain.sum() > _SURELY * np.sqrt(len(gain)) * gain.std()))
+        gain, known_sides = with_traffic - without, min(critical.sum(), (~critical).sum()) >= _FEWEST_CRITICAL
+        sure = float(gain.sum() / max(np.sqrt(len(gain)) * gain.std(), 1e-300))
+        return PairRisk(risk, bool(known_sides and sure > _SURELY), sure > _PROMISING)
 
     def inputs(self, x: Points, seeds: list[int], *, keep: bool = False) -> Points:
         """Return the (n, c) columns that pairs are learned by: metamodel inputs of x (n, d), and covariates."""

@@ -104,13 +104,13 @@ class Learner:
 
     def over_traffic(self, predictor: Predictor, history: History) -> tuple[Predictor, str | None]:
         """Return a predictor with P(critical) as the mean over traffic, and what a record keeps of it; or itself, None."""
-        traffic, requirement = self.traffic, self.scenario.requirement
-        p = None if traffic is None or requirement.combined else traffic.means(history)
+        traffic = self.traffic
+        p = None if traffic is None else traffic.means(history)
         if traffic is None or p is None:
             return predictor, None
         kept = encoded(p)
         mean = MeanOverTraffic.of(self.inputs(traffic.points), decoded(kept), stream(self.seed, "over traffic"))
-        return OverTrafficPredictor(predictor, mean, requirement.critical), kept
+        return OverTrafficPredictor(predictor, mean, self.scenario.requirement.critical), kept
 
     def _bound(self, predictor: Predictor) -> Callable[[Points], Vector] | None:
         """Return quick upper bounds of log a_BI at the inputs' (n, d) unit-cube points; None: the predictor has none."""

@@ -59,7 +59,10 @@ def fit_risk(inputs: Points, score: Vector, margin: Vector, critical: Mask, rng:
 def fit_risk_scored(
     inputs: Points, score: Vector, margin: Vector, critical: Mask, rng: np.random.Generator
 ) -> tuple[Risk, Vector]:
-    """Return what `fit_risk` does, and (n,) log P of what each run was, by what had not seen it."""
+    """Return what `fit_risk` does, and (n,) log P, by what had not seen it, of whether a run was critical.
+
+    With few critical (or safe) runs it is that of whether it is one of the five nearest (or all but the five farthest).
+    """
     n, hits = len(score), int(critical.sum())
     base = float(np.log((hits + 0.5) / (n - hits + 0.5)))
     if n < _FEWEST or np.ptp(score) == 0.0:
@@ -77,13 +80,14 @@ def fit_risk_scored(
         gain = _log_likelihood(_linear(both, with_process), event) - _log_likelihood(_linear(unseen, weight), event)
         if gain.sum() > _SURELY * np.sqrt(n) * gain.std():
             learners, unseen, weight = (*learners, process[0]), both, with_process
+    told = _log_likelihood(_linear(unseen, weight), event)
     weight[-1] += _intercept(_linear(unseen, weight), hits + 0.5, n + 1.0)
 
     def risk(points: Points) -> LogPair:
         at = placed(points)
         return _pair(_linear(np.column_stack([learner(at) for learner in learners]), weight))
 
-    return risk, _log_likelihood(_linear(unseen, weight), critical)
+    return risk, told
 
 
 def _placement(inputs: Points) -> Callable[[Points], Points]:
