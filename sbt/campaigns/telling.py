@@ -97,7 +97,8 @@ def tell_boundary(found: BoundaryConclusion, measured_share: CriticalShare, fact
     """Return the three sentences of a boundary, and how its figures of the critical share fit together."""
     if found.critical_fraction is None:
         return tell_share(measured_share, facts)
-    scores, learned = found.validation, len(facts.history.training)
+    scores, pairs = found.validation, found.over_traffic
+    learned = len(facts.history.training) if pairs is None else pairs.runs
     tested = scores is not None and scores.n > 0 and scores.error_rate is not None
     if tested and scores is not None and scores.error_rate is not None:
         wrong = round(scores.error_rate * scores.n)
