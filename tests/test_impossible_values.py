@@ -67,6 +67,8 @@ def test_what_no_run_can_begin_with_is_refused_at_its_place(tmp_path, key, value
         ("sumo/options/time-to-teleport", "-1"), ("sumo/options/device.rerouting.explicit", "inf"),
         ("insert/other/speed", "max"), ("insert/other/position", "-5"), ("insert/other/position", "random_free"),
         ("insert/other/lane", "best"), ("insert/other/at", '"0:00:01"'),
+        ("insert/other/at", "begin"), ("insert/other/position", "random_location"),
+        ("sumo/options/time-to-teleport.remove", "true"), ("sumo/options/time-to-teleport.highways.min-speed", "19.5"),
     ],
 )  # fmt: skip
 def test_what_sumo_takes_is_taken(tmp_path, key, value):

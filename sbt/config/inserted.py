@@ -22,10 +22,10 @@ __all__ = ["insertion_file"]
 _TYPES = ("DEFAULT_VEHTYPE", "DEFAULT_BIKETYPE", "DEFAULT_TAXITYPE", "DEFAULT_RAILTYPE")
 """Vehicle types that SUMO knows by itself."""
 _WORDS = {
-    "position": ("random", "random_free", "free", "base", "last", "stop", "splitFront"),
+    "position": ("random", "random_free", "random_location", "free", "base", "last", "stop", "splitFront"),
     "speed": ("random", "max", "desired", "speedLimit", "last", "avg"),
     "lane": ("random", "free", "allowed", "best", "best_prob", "first"),
-    "at": ("triggered", "containerTriggered", "now"),
+    "at": ("triggered", "containerTriggered", "now", "begin", "split"),
 }
 """What SUMO takes for a number of a vehicle's start."""
 _SHOWN = 8
