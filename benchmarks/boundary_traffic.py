@@ -57,7 +57,7 @@ def counted(name: str, points: int, runs: int, folder: Path) -> tuple[Points, Po
 def compared(p: Vector, rate: Vector, doubt: Vector) -> tuple[float, float, float]:
     """Return error, log loss and mean P over the true mean, of P (m,) where `rate` (m,) has been met with a variance `doubt`."""
     spread = max(float(rate.var() - doubt.mean()), 1e-12)
-    square, mean = float(((p - rate) ** 2 - doubt).mean()), float(rate.mean())
+    square, mean = float(((p - rate) ** 2 - doubt).mean()), float(np.clip(rate.mean(), 1e-6, 1.0 - 1e-6))
     p = np.clip(p, 1e-6, 1.0 - 1e-6)
     loss = -float((rate * np.log(p) + (1.0 - rate) * np.log1p(-p)).mean())
     return math.sqrt(max(square, 0.0) / spread), loss / -(mean * math.log(mean) + (1 - mean) * math.log1p(-mean)), p.mean() / mean
