@@ -244,6 +244,7 @@ def test_set_replaces_and_adds_values(tmp_path: Path):
         ("budget=two", "--set budget: must be a whole number, but got 'two'"),
         ("bugdet=3", "--set bugdet: unknown key (did you mean 'budget'?)"),
         ("metamodel={kind: 3}", "--set metamodel: metamodel.kind: must be text, but got 3"),
+        ("inputs.kind.choices={true: 0.5, a: 0.5}", "--set inputs.kind.choices: inputs.kind.choices.1: must be text, but got true"),
         ("budget", "--set budget: must be key.path=value, but got 'budget'"),
         ("a..b=3", "--set a..b=3: must be key.path=value"),
         ("scenario.b=2", "--set scenario.b: --set reaches into mappings only, but 'b' would be inside 'plugin.py:SCENARIO'"),

@@ -175,3 +175,6 @@ def test_no_cell_of_the_written_table_is_a_formula(tmp_path):
     assert done.exit_code == 0, done.output
     (row,) = csv.DictReader((tmp_path / "out.csv").read_text().splitlines())
     assert (row["kind"], float(row["a"])) == ("'=1+1", 0.5)
+    done = invoke("predict", tmp_path / "s", "--inputs", tmp_path / "out.csv", "--output", tmp_path / "again.csv")
+    assert done.exit_code == 0, done.output
+    assert (tmp_path / "again.csv").read_text().splitlines()[1] == (tmp_path / "out.csv").read_text().splitlines()[1]

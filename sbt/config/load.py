@@ -115,7 +115,7 @@ def read_text(path: str | Path) -> str:
 
 
 _KIND = re.compile(
-    r"\[(key|number|keys)\]|(constrained|function)-.*|(literal|list|dict|tuple|union|nullable)\[.*\]|float|int|str|bool"
+    r"\[(key|number|keys)\]|(constrained|function)-.*|(literal|list|dict|tuple|union|nullable)\[.*\]|float|int|str|bool|dict|list"
 )
 """What pydantic names in the path of an error beside keys: which of several kinds a value was compared with."""
 

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from sbt.errors import InputError, did_you_mean
+from sbt.files import as_cell
 from sbt.loop.learner import Learner
 from sbt.metamodels.base import Predictor, predicted
 from sbt.metamodels.ended import ended
@@ -331,6 +332,8 @@ def _value(path: Path, number: int, line: list[str], column: int, parameter: Par
     """Return one checked value of a line."""
     text = line[column].strip() if column < len(line) else ""
     if parameter.choices:
+        if text not in parameter.choices and text[1:] in parameter.choices and as_cell(text[1:]) == text:
+            text = text[1:]  # as tables for spreadsheets have it
         try:
             return parameter.number(text)
         except InputError as error:
