@@ -65,7 +65,7 @@ def explained_variance(settings: Settings, history: History, even: Mask | None =
     if len(runs) < _FEWEST or judged.sum() < _FEWEST_JUDGED or np.ptp(y[judged]) == 0.0:
         return None
     inputs = space.metamodel_inputs_at(runs.x)
-    both = np.column_stack([inputs, covariates.at(runs.x, runs.seed.tolist())])
+    both = covariates.beside_inputs(runs.x, runs.seed.tolist())
     alone = out_of_bag(inputs, y, stream(settings.seed, "explained", len(y)), judged)
     whole = max(out_of_bag(both, y, stream(settings.seed, "explained", len(y)), judged), alone)
     return ExplainedVariance(alone, whole - alone, 1.0 - whole, len(runs), int(judged.sum()))

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from sbt.acquisitions import even, is_greedy, log_scores
@@ -203,12 +202,7 @@ class SearchStage:
 
     def _pairs(self, covariates: Covariates, runs: History, u: Points, y: Vector, n: int, rng: np.random.Generator) -> Picks:
         """Return n points with the seeds whose traffic promises most there."""
-        space = self.failure_search.settings.scenario.space
-
-        def draw(points: Points, seeds: NDArray[np.int64]) -> Points:
-            return covariates.at(space.from_unit(points), seeds.tolist())
-
-        found = propose_pairs(self.failure_search.search, draw, u, runs.seed, y, n, rng)
+        found = propose_pairs(self.failure_search.search, covariates.of_points, u, runs.seed, y, n, rng)
         return Picks(found.u, (PAIR,) * len(found.u), seeds=found.seeds)
 
     def _seeded(self, picks: Picks) -> list[PlannedRun]:

@@ -9,10 +9,11 @@ from threadpoolctl import threadpool_limits
 from sbt.campaigns.combinations import few
 from sbt.campaigns.exploration import search_of
 from sbt.campaigns.settings import Settings
-from sbt.loop.drawn_traffic import DrawnTraffic, PairRisk
+from sbt.loop.drawn_traffic import PairRisk
 from sbt.loop.learner import FittedMetamodel
 from sbt.loop.stages import Log
 from sbt.problem.arrays import Points
+from sbt.problem.covariates import Covariates
 from sbt.samplers.pairs import propose_pairs
 from sbt.samplers.search import fill_uniformly
 from sbt.seeds import SEED_END, stream
@@ -51,22 +52,22 @@ def pairs_in_doubt(settings: Settings, fitted: FittedMetamodel | None, log: Log,
     if learned is None or not (learned.promises if few_critical else learned.tells):
         return []
     if few_critical:
-        u, seeds = _searched(settings, traffic, log, wanted)
+        u, seeds = _searched(settings, traffic.covariates, log, wanted)
     else:
-        u, seeds = _drawn(settings, traffic, learned, fitted, log, wanted)
+        u, seeds = _drawn(settings, traffic.covariates, learned, fitted, log, wanted)
     space = settings.scenario.space
     return [PlannedRun(stage, space.named(x), seed=int(k)) for x, k in zip(space.from_unit(u), seeds, strict=True)]
 
 
 def _drawn(
-    settings: Settings, traffic: DrawnTraffic, learned: PairRisk, fitted: FittedMetamodel | None, log: Log, n: int
+    settings: Settings, covariates: Covariates, learned: PairRisk, fitted: FittedMetamodel | None, log: Log, n: int
 ) -> tuple[Points, NDArray[np.int64]]:
     """Return n of 20 n fresh pairs, drawn in proportion to sqrt(P (1 - P)) and P(a run gives a metric)."""
     space, rng = settings.scenario.space, stream(settings.seed, "pairs in doubt", log.iteration)
     u = fill_uniformly(lambda v: space.feasible(space.from_unit(v)), _CANDIDATES * n, space.dimension, rng)
     seeds = rng.integers(0, SEED_END, len(u))
     with threadpool_limits(1):
-        log_p, log_not = learned.risk(traffic.inputs(space.from_unit(u), seeds.tolist()))
+        log_p, log_not = learned.risk(covariates.beside_inputs(space.from_unit(u), seeds.tolist(), keep=False))
     score = 0.5 * (log_p + log_not)
     score = score if fitted is None or fitted.log_success is None else score + fitted.log_success(u)
     gumbel = score + rng.gumbel(size=len(u))  # the largest are a draw without replacement
@@ -76,17 +77,11 @@ def _drawn(
     return u[chosen], seeds[chosen]
 
 
-def _searched(settings: Settings, traffic: DrawnTraffic, log: Log, n: int) -> tuple[Points, NDArray[np.int64]]:
+def _searched(settings: Settings, covariates: Covariates, log: Log, n: int) -> tuple[Points, NDArray[np.int64]]:
     """Return n pairs that promise to be critical."""
-    space, covariates = settings.scenario.space, traffic.covariates
+    space = settings.scenario.space
     runs = log.history.where(log.history.stage != VALIDATION)
-    if covariates is None or len(runs.training) < 2:
-        return np.empty((0, space.dimension)), np.empty(0, dtype=np.int64)
-
-    def draw(points: Points, seeds: NDArray[np.int64]) -> Points:
-        return covariates.at(space.from_unit(points), seeds.tolist())
-
     u, y = np.clip(space.to_unit(runs.x), 0.0, 1.0), settings.scenario.requirement.values(runs)
     rng = stream(settings.seed, "pairs", log.iteration)
-    found = propose_pairs(search_of(settings), draw, u, runs.seed, y, n, rng)
+    found = propose_pairs(search_of(settings), covariates.of_points, u, runs.seed, y, n, rng)
     return found.u, np.array(found.seeds, dtype=np.int64)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -151,7 +151,7 @@ class PairStage:
         if len(runs) < _FEWEST or np.ptp(score) == 0.0:
             return False
         inputs = s.scenario.space.metamodel_inputs_at(runs.x)
-        both = self._inputs(runs.x, self._covariates.at(runs.x, runs.seed.tolist()))
+        both = self._covariates.beside_inputs(runs.x, runs.seed.tolist())
         alone, together = (out_of_bag(u, score, stream(s.seed, "pairs explain")) for u in (inputs, both))
         return together - alone > max(alone, _TELLS)
 
@@ -170,16 +170,13 @@ class PairStage:
         runs = [PlannedRun(LEARNED, space.named(row)) for row in x]
         known = _to_learn(log.history)
 
-        def draw(u: Points, seeds: Seeds) -> Points:
-            return self._covariates.at(space.from_unit(u), seeds.tolist(), keep=False)
-
         if size > drawn and len(known) > 1:
             search = Search(
                 s.scenario.requirement.critical, metamodel_of(s), space.metamodel_inputs,
                 lambda u: space.feasible(space.from_unit(u)), cube=space.cube,
             )  # fmt: skip
             u, y = np.clip(space.to_unit(known.x), 0.0, 1.0), s.scenario.requirement.values(known)
-            found = propose_pairs(search, draw, u, known.seed, y, size - drawn, rng)
+            found = propose_pairs(search, partial(self._covariates.of_points, keep=False), u, known.seed, y, size - drawn, rng)
             rows = space.from_unit(found.u)
             runs += [PlannedRun(SEARCHED, space.named(v), seed=k) for v, k in zip(rows, found.seeds, strict=True)]
         proposal = EstimationProposal(EXPLORE, "pairs", modes=hits, nominal=NominalDraws((1.0,) * drawn), pairs=0)
@@ -201,7 +198,7 @@ class PairStage:
     def _learned(self, history: History, rng: np.random.Generator) -> tuple[Risk, tuple[Risk, ...]]:
         """Return P(critical) of pairs, a failed run as safe, and that of each requirement of a combination."""
         requirement, known = self.settings.scenario.requirement, _to_learn(history)
-        inputs = self._inputs(known.x, self._covariates.at(known.x, known.seed.tolist()))
+        inputs = self._covariates.beside_inputs(known.x, known.seed.tolist())
 
         def learn(part: Requirement) -> Risk:
             margin = np.where(known.ok, np.nan_to_num(part.depths(known), nan=np.inf, posinf=np.inf), np.inf)
@@ -210,15 +207,11 @@ class PairStage:
         whole = learn(requirement)
         return whole, tuple(learn(part) for part in requirement.parts) if requirement.combined else ()
 
-    def _inputs(self, x: Points, covariates: Points) -> Points:
-        space = self.settings.scenario.space
-        return np.column_stack([space.metamodel_inputs_at(x), covariates])
-
     def _drawn(self, n: int, rng: np.random.Generator) -> _Pool:
         """Return n pairs as they come: inputs by their distribution, seeds uniform."""
         x = self.settings.scenario.space.sample(n, rng)
         seeds = rng.integers(0, SEED_END, n)
-        return _Pool(x, seeds, self._inputs(x, self._covariates.at(x, seeds.tolist(), keep=False)))
+        return _Pool(x, seeds, self._covariates.beside_inputs(x, seeds.tolist(), keep=False))
 
     def _ratio(self, log: Log) -> float:
         """Return how many pairs of the pool there are for each draw: where the draws would err less, more."""

@@ -42,7 +42,7 @@ class PairRisk:
     """What runs teach of pairs of inputs and seed.
 
     Attributes:
-        risk: (n, c) `DrawnTraffic.inputs` to P(critical).
+        risk: (n, c) `Covariates.beside_inputs` to P(critical).
         tells: left-out runs are surely likelier by it than by their inputs alone, and some of each side are known.
         promises: left-out runs, or of few critical ones the nearest to them, are rather likelier by it.
     """
@@ -105,13 +105,13 @@ class DrawnTraffic:
         key = runs.index.tobytes()
         if key not in self._newest:
             self._newest.clear()
-            self._newest[key] = self._fitted(runs)
+            self._newest[key] = self._fitted(self.covariates, runs)
         return self._newest[key]
 
-    def _fitted(self, runs: History) -> PairRisk:
+    def _fitted(self, covariates: Covariates, runs: History) -> PairRisk:
         critical = self.scenario.requirement.critical_runs(runs)
         margin = np.nan_to_num(self.scenario.requirement.margins(runs), nan=np.inf, posinf=np.inf)
-        known, near = self.inputs(runs.x, runs.seed.tolist(), keep=True), scores(margin)
+        known, near = covariates.beside_inputs(runs.x, runs.seed.tolist()), scores(margin)
         alone = self.scenario.space.metamodel_inputs_at(runs.x)
         with threadpool_limits(1):
             (risk, with_traffic), (_, without) = (
@@ -121,17 +121,14 @@ class DrawnTraffic:
         sure = float(gain.sum() / max(np.sqrt(len(gain)) * gain.std(), 1e-300))
         return PairRisk(risk, bool(known_sides and sure > _SURELY), sure > _PROMISING)
 
-    def inputs(self, x: Points, seeds: list[int], *, keep: bool = False) -> Points:
-        """Return the (n, c) columns that pairs are learned by: metamodel inputs of x (n, d), and covariates."""
-        if self.covariates is None:
-            raise ValueError("pairs need covariates")
-        return np.column_stack([self.scenario.space.metamodel_inputs_at(x), self.covariates.at(x, seeds, keep=keep)])
-
     @cached_property
     def _fresh(self) -> Points:
         """(m s, c) columns of fresh pairs, the seeds of a point one after the other."""
+        if self.covariates is None:
+            raise ValueError("pairs need covariates")
         seeds = stream(self.seed, "fresh traffic").integers(0, SEED_END, len(self.points) * _SEEDS)
-        return self.inputs(np.repeat(self.scenario.space.from_unit(self.points), _SEEDS, axis=0), seeds.tolist())
+        x = np.repeat(self.scenario.space.from_unit(self.points), _SEEDS, axis=0)
+        return self.covariates.beside_inputs(x, seeds.tolist(), keep=False)
 
 
 def encoded(p: Vector) -> str:

@@ -9,6 +9,7 @@ from numbers import Real
 from typing import Protocol, runtime_checkable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sbt.errors import RAISED, InputError, SbtError, described, shown
 from sbt.problem.arrays import Points, Vector
@@ -91,6 +92,14 @@ class Covariates:
             if keep and known is None:
                 self._known[key] = rows[k].copy()
         return rows
+
+    def of_points(self, u: Points, seeds: NDArray[np.int64], *, keep: bool = True) -> Points:
+        """Return `at` of points of the unit cube u (n, d), with their n seeds."""
+        return self.at(self.scenario.space.from_unit(u), seeds.tolist(), keep=keep)
+
+    def beside_inputs(self, x: Points, seeds: Sequence[int], *, keep: bool = True) -> Points:
+        """Return the (n, e + c) columns that pairs are learned by: metamodel inputs of x (n, d), and `at`."""
+        return np.column_stack([self.scenario.space.metamodel_inputs_at(x), self.at(x, seeds, keep=keep)])
 
     def _check_unchanged(self) -> None:
         """Compute the covariates of the first pair again: runs since then must not have changed them."""
