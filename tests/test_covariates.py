@@ -169,6 +169,9 @@ def test_what_cannot_be_told_is_said(tmp_path: Path) -> None:
     endless.known_before = lambda values, seed: {"late": float("inf")}  # type: ignore[method-assign]
     with pytest.raises(InputError, match="covariate late must be finite, but is inf at a="):
         run(tmp_path / "endless", scenario=scenario_of(endless))
+    endless.known_before = lambda values, seed: {"late": -1e31}  # type: ignore[method-assign]
+    with pytest.raises(InputError, match=r"covariate late must be within ±1e\+30, .* but is -1e\+31 at a="):
+        run(tmp_path / "large", scenario=scenario_of(endless))
     text, rows = {"late": "a"}, [1.0]
     for told, said in ((text, "covariate late must be a number, but is 'a' at a="), (rows, "must return numbers by name")):
         endless.known_before = lambda values, seed, told=told: told  # type: ignore

@@ -106,6 +106,31 @@ def test_a_campaign_that_stopped_and_went_on_in_other_processes_has_the_same_pai
     assert whole[columns].equals(parts[columns])
 
 
+@dataclass(frozen=True)
+class Failing(Drawn):
+    """Runs with w > 0 (or below -0.5) give no metric."""
+
+    low: bool = False
+
+    def __call__(self, values: dict[str, float], seed: int) -> dict[str, float]:
+        w = np.random.default_rng(seed).standard_normal()
+        if w < -0.5 if self.low else w > 0.0:
+            raise ValueError("blocked")
+        return super().__call__(values, seed)
+
+
+@pytest.mark.parametrize("low", [False, True])
+def test_traffic_with_which_runs_fail_is_not_that_of_those_that_give_a_metric(low: bool, tmp_path: Path) -> None:
+    w, e = np.random.default_rng(5).standard_normal((2, 20_000))
+    gives = w >= -0.5 if low else w <= 0.0
+    rate = np.array([((1.0 + x + w + 0.3 * e <= 0.0) & gives).sum() / gives.sum() for x in X])
+    found = run(tmp_path / "failing", evaluate=Failing(low=low), budget=150)
+    p = np.asarray(found.predict({"x": X, "idle": 0.5})["p_critical"])
+    assert found.conclusion.over_traffic is not None
+    assert float(np.sqrt(np.mean((p - rate) ** 2))) < 0.12
+    assert found.conclusion.over_traffic.chosen == int(found.frame.seed_chosen.sum())
+
+
 def test_of_a_combination_seeds_are_not_chosen(tmp_path: Path) -> None:
     both = {"all": [{"metric": "y", "critical": [None, 0.0]}, {"metric": "z", "critical": [None, 1.0]}]}
     found = run(tmp_path / "both", budget=60, requirement=both)

@@ -12,7 +12,7 @@ from sbt.acquisitions import even, is_greedy
 from sbt.campaigns.chance import ChancePlace, chance_place
 from sbt.campaigns.choices import ChoiceRule, from_roi, greedily, mixed
 from sbt.campaigns.combinations import EveryCombination, every_combination
-from sbt.campaigns.doubt import OverTraffic, TrafficDoubt, over_traffic, traffic_doubt
+from sbt.campaigns.doubt import OverTraffic, TrafficDoubt, over_traffic, traffic_doubt, unused_words
 from sbt.campaigns.each import each_share, fits_words, independence_words, shares_words
 from sbt.campaigns.explained import ExplainedVariance, explained_variance
 from sbt.campaigns.exploration import largest_batch, space_filling
@@ -73,6 +73,7 @@ class BoundaryConclusion:
         failing_range: ends of the failing fraction; None: it is not known to be a part of the space.
         critical_combinations: where no input is continuous; None: one is, or the metamodel sees none.
         over_traffic: P(critical) is the mean over the traffic that seeds draw; None: what inputs alone tell.
+        unused_seeds: runs whose seeds were chosen although P(critical) is not learned from what they draw; None: there are none.
         chance_place: where runs of a noisy simulator are critical most often, though not most of them are; None: most are.
     """
 
@@ -101,6 +102,7 @@ class BoundaryConclusion:
     critical_combinations: CriticalCombinations | None = optional()
     chance_place: ChancePlace | None = optional()
     over_traffic: OverTraffic | None = optional()
+    unused_seeds: int | None = optional()
 
     def to_dict(self) -> Json:
         """Return the JSON of the command line."""
@@ -129,6 +131,8 @@ class BoundaryConclusion:
             found.append(self.explained.sentence(facts.requirement.told_as))
         if self.over_traffic is not None:
             found.append(self.over_traffic.sentence())
+        if self.unused_seeds is not None:
+            found.append(unused_words(self.unused_seeds))
         if self.doubt is not None:
             found.append(self.doubt.sentence())
         return found
@@ -174,7 +178,8 @@ def recipe(settings: Settings) -> Campaign:
             critical_share(log.history.where(unchosen), settings.scenario), by_chance(fitted),
             failing_range(learner, fitted, len(log.history.finished)),
             None if every is not None else critical_combinations(log_odds, settings.scenario, fitted.log_success),
-            _by_chance(log_odds, log.history, settings) if every is None else None, over_traffic(fitted, log.history),
+            _by_chance(log_odds, log.history, settings) if every is None else None,
+            over_traffic(fitted, log.history), None if r.over_traffic else int((~log.history.drawn).sum()) or None,
         ), fitted  # fmt: skip
 
     most = largest_batch if settings.acquisition is None else None

@@ -67,6 +67,8 @@ def chance_place(log_odds: LogOdds, scenario: LogicalScenario, seed: int, u: Poi
     least = _HALF * float(np.quantile(p, _LARGEST))
     if least < _HALF * _UNEVEN * float(p.mean()) or (not likely.any() and bool((p > 0.5).any())):
         return None
+    if least == 0.0:
+        return None
     above = np.log(least / (1.0 - least))
     there = own > above
     if hit[there].sum() < _FEWEST or _as_elsewhere(hit, there) > _CHANCE:

@@ -10,7 +10,7 @@ from sbt.loop.drawn_traffic import DrawnTraffic
 from sbt.loop.learner import FittedMetamodel
 from sbt.store.history import VALIDATION, History
 
-__all__ = ["OverTraffic", "TrafficDoubt", "over_traffic", "traffic_doubt"]
+__all__ = ["OverTraffic", "TrafficDoubt", "over_traffic", "traffic_doubt", "unused_words"]
 
 _FEWEST, _EITHER = 100, 10
 """Runs, and critical and safe ones among them, from which on shares are stated."""
@@ -68,8 +68,16 @@ def over_traffic(fitted: FittedMetamodel, history: History) -> OverTraffic | Non
     """Return from how many runs P(critical) was learned as the mean over traffic; None where inputs alone tell it."""
     if fitted.record.over_traffic is None:
         return None
-    runs = history.where(history.ok & (history.stage != VALIDATION))
-    return OverTraffic(len(runs), int((~runs.drawn).sum()))
+    return OverTraffic(int((history.ok & (history.stage != VALIDATION)).sum()), int((~history.drawn).sum()))
+
+
+def unused_words(chosen: int) -> str:
+    """Return in words that seeds of so many runs were chosen, and P(critical) is not learned from what they draw."""
+    were = "was chosen for what it draws" if chosen == 1 else "were chosen for what they draw"
+    return (
+        f"{plural(chosen, 'seed')} {were}:"
+        f" as left-out runs are not surely likelier by that, P(critical) is learned from the inputs of the other runs."
+    )
 
 
 def traffic_doubt(settings: Settings, history: History) -> TrafficDoubt | None:

@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from sbt.metamodels.risk import Risk, fit_risk_scored
+from sbt.metamodels.risk import Risk, fit_risk, fit_risk_scored
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.covariates import Covariates
 from sbt.problem.plain import JsonMapping
@@ -34,6 +34,8 @@ _FEWEST_POINTS = 16
 """Feasible points of the space."""
 _SURELY, _PROMISING = 2.0, 0.5
 """Standard errors by which the traffic makes left-out runs likelier, from which on it counts, or pairs are searched by it."""
+_LEAST_GIVES = 0.02
+"""P(a run gives a metric) below which what is critical of those that do is not told."""
 _STEPS = 2**16 - 1
 
 
@@ -42,12 +44,14 @@ class PairRisk:
     """What runs teach of pairs of inputs and seed.
 
     Attributes:
-        risk: (n, c) `Covariates.beside_inputs` to P(critical).
+        risk: (n, c) `Covariates.beside_inputs` to P(critical); a run that fails is not.
+        fails: the same to P(a run gives no metric); None: all gave one.
         tells: left-out runs are surely likelier by it than by their inputs alone, and some of each side are known.
         promises: left-out runs, or of few critical ones the nearest to them, are rather likelier by it.
     """
 
     risk: Risk
+    fails: Risk | None
     tells: bool
     promises: bool
 
@@ -90,17 +94,23 @@ class DrawnTraffic:
         if self.covariates is None:
             return None if self.kept is None else decoded(self.kept)
         found = self.learned(history)
-        return None if found is None or not found.tells else self.table(found.risk).mean(axis=1)
+        if found is None or not found.tells:
+            return None
+        p = self.table(found.risk).mean(axis=1)
+        if found.fails is None:
+            return p
+        gives = 1.0 - self.table(found.fails).mean(axis=1)  # traffic with which runs fail is not that of those that give one
+        return np.minimum(p / np.maximum(gives, _LEAST_GIVES), 1.0)
 
     def table(self, risk: Risk) -> Points:
-        """Return (m, s) P(critical) at the points with each of s fresh seeds."""
+        """Return (m, s) P of what a risk tells, at the points with each of s fresh seeds."""
         with threadpool_limits(1):
             return np.exp(risk(self._fresh)[0]).reshape(len(self.points), _SEEDS)
 
     def learned(self, history: History) -> PairRisk | None:
         """Return what all runs but held-out ones teach of pairs; None where they are too few, or hardly a point is feasible."""
-        runs = history.where(history.ok & (history.stage != VALIDATION) & (history.columns["level"] == 0))
-        if self.covariates is None or len(runs) < _FEWEST or len(self.points) < _FEWEST_POINTS:
+        runs = history.where((history.stage != VALIDATION) & (history.columns["level"] == 0))
+        if self.covariates is None or runs.ok.sum() < _FEWEST or len(self.points) < _FEWEST_POINTS:
             return None
         key = runs.index.tobytes()
         if key not in self._newest:
@@ -111,6 +121,7 @@ class DrawnTraffic:
     def _fitted(self, covariates: Covariates, runs: History) -> PairRisk:
         critical = self.scenario.requirement.critical_runs(runs)
         margin = np.nan_to_num(self.scenario.requirement.margins(runs), nan=np.inf, posinf=np.inf)
+        margin, rng = np.where(runs.ok, margin, np.inf), stream(self.seed, "traffic fails", len(runs))
         known, near = covariates.beside_inputs(runs.x, runs.seed.tolist()), scores(margin)
         alone = self.scenario.space.metamodel_inputs_at(runs.x)
         with threadpool_limits(1):
@@ -118,8 +129,11 @@ class DrawnTraffic:
                 fit_risk_scored(rows, near, margin, critical, stream(self.seed, "traffic", len(runs))) for rows in (known, alone)
             )
         gain, known_sides = with_traffic - without, min(critical.sum(), (~critical).sum()) >= _FEWEST_CRITICAL
+        gives = np.where(runs.ok, 1.0, -1.0)
+        with threadpool_limits(1):
+            fails = None if runs.ok.all() else fit_risk(known, gives, gives, ~runs.ok, rng)
         sure = float(gain.sum() / max(np.sqrt(len(gain)) * gain.std(), 1e-300))
-        return PairRisk(risk, bool(known_sides and sure > _SURELY), sure > _PROMISING)
+        return PairRisk(risk, fails, bool(known_sides and sure > _SURELY), sure > _PROMISING)
 
     @cached_property
     def _fresh(self) -> Points:

@@ -19,6 +19,9 @@ from sbt.problem.scenario import LogicalScenario, Simulate
 __all__ = ["Covariates", "DrawsAhead", "telling_all"]
 
 
+_LARGEST = 1e30
+
+
 @runtime_checkable
 class DrawsAhead(Protocol):
     """A `simulate` or `evaluate` that can tell what it draws for a seed, without running."""
@@ -124,6 +127,9 @@ class Covariates:
         for name, value in found.items():
             if not math.isfinite(value):
                 raise InputError(f"covariate {name} must be finite, but is {value} at {written(values)}, seed {seed}")
+            if abs(value) > _LARGEST:
+                rule = f"covariate {name} must be within \N{PLUS-MINUS SIGN}{_LARGEST:g}, as it is learned in single precision"
+                raise InputError(f"{rule}, but is {value:g} at {written(values)}, seed {seed}")
         return np.array([found[name] for name in self.names], dtype=np.float64)
 
 
