@@ -15,7 +15,7 @@ from test_evidence import deaf, net, simulation, vehicle
 
 from sbt.execution.spec import ScenarioSpec
 from sbt.execution.worker import run_job
-from sbt.metrics.traffic import any_collision
+from sbt.metrics.traffic import any_collision, any_impact_speed
 from sbt.problem.outcome import Job, Outcome
 from sbt.sumo.leaving import Leaving
 
@@ -158,3 +158,15 @@ def test_an_ego_touches_nobody_after_it_has_arrived(tmp_path: Path, step: str):
         trace = arriving(tmp_path, step, "4.5", rear=rear, speed=speed)
         assert (trace.ended, any_collision()(trace)) == ("left", 0.0)
         assert np.array_equal(trace.x[:, 0], alone.x[:, 0])
+
+
+@pytest.mark.sumo
+@pytest.mark.parametrize("step", ["0.01", "0.1"])
+def test_who_meets_somebody_at_its_end_meets_at_its_speed(tmp_path: Path, step: str):
+    """SUMO lets it arrive a tenth of a metre before; driving the rest in the same step looked like 600 m/s^2."""
+    for k in range(8):
+        folder = tmp_path / str(k)
+        folder.mkdir()
+        trace = arriving(folder, step, "4.5", rear=399.95, departPos=390.0 + 0.13 * k * float(step), departSpeed=10.0, maxSpeed=10.0)
+        assert any_impact_speed()(trace) == pytest.approx(10.0)
+        assert float(np.abs(trace.acceleration[:, 0]).max()) < 1e-6

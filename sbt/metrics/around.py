@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from sbt.metrics.cache import per_trace
-from sbt.metrics.geometry import rectangle_distance, select_instants
 from sbt.metrics.longitudinal import FAR, first_contact
+from sbt.metrics.nearest import least_distance
 from sbt.problem.arrays import Vector
 from sbt.problem.trace import States, Trace
 
@@ -53,11 +53,18 @@ def around(trace: Trace, ego: str) -> Around:
 def first_contacts(trace: Trace, ego: str) -> dict[str, int]:
     """Return the index of the first contact with everyone who touches the ego, by name."""
     seen = around(trace, ego)
-    moved = np.hypot(seen.dx[1:] - seen.dx[:-1], seen.dy[1:] - seen.dy[:-1])
-    least = np.concatenate([seen.apart[:1], 0.5 * (seen.apart[1:] + seen.apart[:-1] - moved)])  # none in the step is smaller
-    near = np.asarray((np.where(np.isnan(least), seen.apart, least) <= seen.reach).any(axis=0))  # NaN: who comes has no step
+    near = _least_apart(trace, ego) <= seen.reach
     found = ((trace.actors[k], first_contact(trace, ego, trace.actors[k])) for k in seen.others if near[k])
     return {name: k for name, k in found if k is not None}
+
+
+@per_trace
+def _least_apart(trace: Trace, ego: str) -> Vector:
+    """Return (m,) the smallest distance of everyone's centre to the ego's, at an instant or between two (m)."""
+    seen = around(trace, ego)
+    moved = np.hypot(seen.dx[1:] - seen.dx[:-1], seen.dy[1:] - seen.dy[:-1])
+    between = 0.5 * (seen.apart[1:] + seen.apart[:-1] - moved)  # none in the step is smaller
+    return np.asarray(np.fmin.reduce(np.concatenate([seen.apart, between]), axis=0, initial=np.inf))
 
 
 def smallest_distance(trace: Trace, ego: str) -> float:
@@ -65,12 +72,8 @@ def smallest_distance(trace: Trace, ego: str) -> float:
     if first_contacts(trace, ego):
         return 0.0
     seen, least, own = around(trace, ego), FAR, trace.actor(ego)
+    within = _least_apart(trace, ego) - seen.reach
     for k in seen.others:
-        (rows,) = (seen.apart[:, k] - seen.reach[k] < least).nonzero()
-        if len(rows):
-            name, apart = trace.actors[k], seen.apart[rows, k]
-            if name not in trace.parts and ego not in trace.parts:  # no rectangle is farther away than its centre
-                rows = rows[apart - seen.reach[k] <= apart.min()]
-            distance = rectangle_distance(select_instants(own, rows), select_instants(trace.actor(name), rows))
-            least = min(least, float(np.fmin.reduce(distance)))
+        if within[k] < least:
+            least = least_distance(own, trace.actor(trace.actors[k]), least)
     return least

@@ -8,7 +8,7 @@ import numpy as np
 
 from sbt.problem.arrays import Vector
 
-__all__ = ["disc_span", "discs_of"]
+__all__ = ["disc_span", "discs_of", "is_person"]
 
 _PERSON = 1.0
 """Whose body is shorter and narrower than this (m) is a person."""
@@ -21,6 +21,11 @@ class _Body(Protocol):
     def length(self) -> Any: ...
     @property
     def width(self) -> Any: ...
+
+
+def is_person(body: _Body) -> Any:
+    """Return whether a body, or (n,) whether each of some, is that of a person."""
+    return np.maximum(body.length, body.width) < _PERSON
 
 
 def discs_of(a: _Body, b: _Body) -> Any:

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from sbt.metrics.arcs import on_arcs
 from sbt.metrics.discs import disc_span, discs_of
 from sbt.problem.arrays import Mask, Vector
 from sbt.problem.trace import ActorTrace, select_parts
@@ -333,23 +334,11 @@ def _touch_in(a: ActorTrace, b: ActorTrace, k: int, *, turning: bool, slid: bool
 
 
 def _on_arc(actor: ActorTrace, k: int, bend: float) -> tuple[Vector, Vector, Rectangles]:
-    """Return a rectangle at the ends of the parts of a step, and where its centre was at their begins.
-
-    The centre drives a cubic from one instant to the next, along the headings at both; with a bend of 0 the chord.
-    """
-    s = np.linspace(0.0, 1.0, _ARCS + 1)
-    before = k - 1
-    old, turn = float(actor.heading[before]), math.remainder(float(actor.heading[k] - actor.heading[before]), math.tau)
-    dx, dy = actor.x[k] - actor.x[before], actor.y[k] - actor.y[before]
-    half = 0.5 * turn
-    length = math.hypot(dx, dy) * (half / math.sin(half) if abs(half) > 1e-6 else 1.0)
-    length = math.copysign(length, dx * math.cos(old + half) + dy * math.sin(old + half))  # it may drive backwards
-    out, into = bend * s * (1.0 - s) ** 2 * length, -bend * s * s * (1.0 - s) * length
-    come = s + bend * (s * s * (3.0 - 2.0 * s) - s)
-    x = actor.x[before] + come * dx + out * math.cos(old) + into * math.cos(old + turn)
-    y = actor.y[before] + come * dy + out * math.sin(old) + into * math.sin(old + turn)
+    """Return a rectangle at the ends of the parts of a step, and where its centre was at their begins."""
+    start, end = (tuple(v[i : i + 1] for v in (actor.x, actor.y, actor.heading)) for i in (k - 1, k))
+    x, y, heading = (v[0] for v in on_arcs(start, end, np.linspace(0.0, 1.0, _ARCS + 1), bend))  # type: ignore[arg-type]
     size = np.full(_ARCS, actor.length), np.full(_ARCS, actor.width)
-    return x[:-1], y[:-1], Rectangles(x[1:], y[1:], old + s[1:] * turn, *size)
+    return x[:-1], y[:-1], Rectangles(x[1:], y[1:], heading[1:], *size)
 
 
 def select_instants(actor: ActorTrace, i: slice | np.ndarray) -> ActorTrace:

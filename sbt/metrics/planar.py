@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from sbt.metrics.arcs import finer, parts_of_turns
 from sbt.metrics.around import around, first_contacts
 from sbt.metrics.geometry import (
     Rectangles,
@@ -22,6 +23,7 @@ from sbt.metrics.geometry import (
     time_to_contact,
 )
 from sbt.metrics.longitudinal import FAR, HORIZON, first_contact, relative_speed_at_contact
+from sbt.metrics.nearest import least_distance
 from sbt.problem.arrays import Vector
 from sbt.problem.metric import Metric
 from sbt.problem.trace import ActorTrace, Trace
@@ -78,9 +80,15 @@ def distance(trace: Trace, ego: str = "ego", other: str = "co", margin: float = 
 def distance_min(ego: str = "ego", other: str = "co") -> Metric:
     """Return the smallest distance between the rectangles (m), 0 for a collision, at most 1,000."""
     return Metric(
-        "distance_min", lambda trace: float(distance(trace, ego, other).min()), "m", "low", FAR,
-        "smallest Euclidean distance between the rectangles",
+        "distance_min", lambda trace: _smallest_distance(trace, ego, other), "m", "low", FAR,
+        "smallest Euclidean distance between the rectangles, also between instants",
     )  # fmt: skip
+
+
+def _smallest_distance(trace: Trace, ego: str, other: str) -> float:
+    if first_contact(trace, ego, other) is not None:
+        return 0.0
+    return least_distance(trace.actor(ego), trace.actor(other), FAR)
 
 
 def severity(ego: str = "ego", other: str = "co") -> Metric:
@@ -93,7 +101,7 @@ def severity(ego: str = "ego", other: str = "co") -> Metric:
     def function(trace: Trace) -> float:
         if first_contact(trace, ego, other) is not None:
             return 0.0 - relative_speed_at_contact(trace, ego, other)
-        return float(distance(trace, ego, other).min())
+        return _smallest_distance(trace, ego, other)
 
     return Metric("severity", function, "m; -m/s", "low", FAR, "smallest distance, or minus the impact speed where they collide")
 
@@ -111,14 +119,14 @@ def post_encroachment_time(trace: Trace, ego: str = "ego", other: str = "co") ->
     any spot in it, and the PET of the conflict area is smaller.) For road users that follow each other it is the
     time gap, for which there is no conflict area.
     """
-    a, b = trace.actor(ego), trace.actor(other)
-    n = len(trace.time)
     if first_contact(trace, ego, other) is not None:
         return 0.0
-    if n < 2 or not _paths_near(a, b):
+    if len(trace.time) < 2:
         return HORIZON
-    step = float(trace.time[-1] - trace.time[0]) / (n - 1)
-    limit = min(n - 1, int(HORIZON / step))
+    (a, b), step = _on_their_ways(trace, [trace.actor(ego), trace.actor(other)])
+    if not _paths_near(a, b):
+        return HORIZON
+    limit = min(len(a.x) - 1, int(HORIZON / step))
     return min(HORIZON, step * min(_least_shift(own, [later], limit) for own, later in ((a, b), (b, a))))
 
 
@@ -141,17 +149,30 @@ def time_behind(
     touched = first_contacts(trace, ego) if other is None else first_contact(trace, ego, other) is not None
     if touched:
         return 0.0
-    a = trace.actor(ego)
+    if len(trace.time) < 2:
+        return horizon
+    others = _near_paths(trace, ego, math.ceil(horizon / _step(trace))) if other is None else [other]
+    (a, *following), step = _on_their_ways(trace, [trace.actor(name) for name in (ego, *others)])
     inside = np.arange(len(a.x)) if zone is None else np.flatnonzero(np.hypot(a.x - zone[0], a.y - zone[1]) <= zone[2])
     if inside.size < 2:
         return horizon
     first, n = int(inside[0]), int(inside[-1]) + 1 - int(inside[0])
-    step = float(trace.time[-1] - trace.time[0]) / (len(trace.time) - 1)
-    limit = math.ceil(horizon / step)
-    others = _near_paths(trace, ego, limit) if other is None else [other]
     own = select_instants(a, slice(first, first + n))
-    later = [select_instants(b, slice(first, None)) for b in map(trace.actor, others) if other is None or _paths_near(a, b)]
-    return min(horizon, step * _least_shift(own, later, min(len(trace.time) - first - 1, limit)))
+    later = [select_instants(b, slice(first, None)) for b in following if other is None or _paths_near(a, b)]
+    limit = min(len(a.x) - first - 1, math.ceil(horizon / step))
+    return min(horizon, step * _least_shift(own, later, limit))
+
+
+def _step(trace: Trace) -> float:
+    """Return the step of a trace (s)."""
+    return float(trace.time[-1] - trace.time[0]) / (len(trace.time) - 1)
+
+
+def _on_their_ways(trace: Trace, actors: list[ActorTrace]) -> tuple[list[ActorTrace], float]:
+    """Return actors at instants between which none of them turns far, and the time between these (s)."""
+    step = _step(trace)
+    parts = parts_of_turns(actors, step)
+    return [finer(actor, parts) for actor in actors], step / parts
 
 
 def _near_paths(trace: Trace, ego: str, horizon: int) -> list[str]:

@@ -11,12 +11,12 @@ the road user behind: the ego cannot violate it where the other is completely be
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields
 
 import numpy as np
 
 from sbt.errors import InputError
+from sbt.metrics.arcs import finer, parts_of_passing
 from sbt.metrics.exposure import integral
 from sbt.metrics.geometry import part_pairs
 from sbt.metrics.longitudinal import FAR
@@ -111,8 +111,8 @@ class _Relation:
     turn: Vector
 
 
-def _relation(trace: Trace, ego: str, other: str) -> _Relation:
-    found = [_relation_of(a, b) for a, b in part_pairs(trace.actor(ego), trace.actor(other))]
+def _relation(one: ActorTrace, two: ActorTrace) -> _Relation:
+    found = [_relation_of(a, b) for a, b in part_pairs(one, two)]
     if len(found) == 1:
         return found[0]
     apart = np.stack([np.maximum(r.gap, r.clearance) for r in found])  # (pairs, t)
@@ -144,7 +144,7 @@ def _behind(trace: Trace, ego: str, other: str, aside: Vector | float) -> Mask:
 
 def longitudinal_margin(trace: Trace, ego: str, other: str, margin: float = 0.0, rules: Rss = DEFAULT) -> Vector:
     """Return the (t,) longitudinal distance minus the safe one (m), at any lateral position; 1,000 where the ego has no duty."""
-    r, own = _relation(trace, ego, other), trace.actor(ego).speed
+    r, own = _relation(trace.actor(ego), trace.actor(other)), trace.actor(ego).speed
     cos = np.cos(r.turn)
     along = np.abs(trace.actor(other).speed * cos)
     same = rules.same_direction(np.where(r.ahead, own, along), np.where(r.ahead, along, own))
@@ -160,36 +160,41 @@ def _safe_aside(r: _Relation, other: ActorTrace, rules: Rss) -> Vector:
 
 def lateral_margin(trace: Trace, ego: str, other: str, margin: float = 0.0, rules: Rss = DEFAULT) -> Vector:
     """Return the (t,) lateral distance minus the safe one (m), at any longitudinal position; at most 1,000."""
-    r = _relation(trace, ego, other)
-    safe = _safe_aside(r, trace.actor(other), rules)
+    return _margin_aside(_relation(trace.actor(ego), trace.actor(other)), trace.actor(other), rules)
+
+
+def _margin_aside(r: _Relation, other: ActorTrace, rules: Rss) -> Vector:
+    safe = _safe_aside(r, other, rules)
     return np.where(np.abs(np.cos(r.turn)) >= _MIN_COS, np.minimum(r.clearance - safe, FAR), FAR)
-
-
-def _smallest(name: str, margin: Callable[[Trace], Vector], where: Callable[[Trace], Mask], description: str) -> Metric:
-    """Return the smallest margin at the instants where a condition holds as a metric."""
-
-    def function(trace: Trace) -> float:
-        instants = where(trace)
-        return float(margin(trace)[instants].min()) if instants.any() else FAR
-
-    return Metric(name, function, "m", "low", FAR, description, _SOURCE)
 
 
 def rss_longitudinal_min(ego: str = "ego", other: str = "co", margin: float = 0.0, rules: Rss = DEFAULT) -> Metric:
     """Return the smallest longitudinal distance minus the safe one while the other is in the ego's path (m)."""
-    return _smallest(
-        "rss_longitudinal_min", lambda trace: longitudinal_margin(trace, ego, other, rules=rules),
-        lambda trace: (_relation(trace, ego, other).clearance < margin) & ~_behind(trace, ego, other, margin),
-        "smallest gap less the safe longitudinal distance of RSS, while the other is in the ego's path",
+
+    def function(trace: Trace) -> float:
+        r = _relation(trace.actor(ego), trace.actor(other))
+        in_path = (r.clearance < margin) & ~_behind(trace, ego, other, margin)
+        return float(longitudinal_margin(trace, ego, other, rules=rules)[in_path].min(initial=FAR))
+
+    return Metric(
+        "rss_longitudinal_min", function, "m", "low", FAR,
+        "smallest gap less the safe longitudinal distance of RSS, while the other is in the ego's path", _SOURCE,
     )  # fmt: skip
 
 
 def rss_lateral_min(ego: str = "ego", other: str = "co", rules: Rss = DEFAULT) -> Metric:
-    """Return the smallest lateral distance minus the safe one while the two are level (m)."""
-    return _smallest(
-        "rss_lateral_min", lambda trace: lateral_margin(trace, ego, other, rules=rules),
-        lambda trace: _relation(trace, ego, other).gap < 0,
-        "smallest lateral clearance less the safe lateral distance of RSS, while the two are level",
+    """Return the smallest lateral distance minus the safe one while the two are level (m), at instants or between them."""
+
+    def function(trace: Trace) -> float:
+        own, co = trace.actor(ego), trace.actor(other)
+        parts = parts_of_passing(own, co)
+        own, co = finer(own, parts), finer(co, parts)
+        r = _relation(own, co)
+        return float(_margin_aside(r, co, rules)[r.gap < 0].min(initial=FAR))
+
+    return Metric(
+        "rss_lateral_min", function, "m", "low", FAR,
+        "smallest lateral clearance less the safe lateral distance of RSS, while the two are level", _SOURCE,
     )  # fmt: skip
 
 
@@ -200,7 +205,7 @@ def rss_violation(ego: str = "ego", other: str = "co", rules: Rss = DEFAULT) -> 
         longitudinal = longitudinal_margin(trace, ego, other, rules=rules)
         dangerous = (longitudinal < 0) & (lateral_margin(trace, ego, other, rules=rules) < 0)
         if dangerous.any():
-            safe = _safe_aside(_relation(trace, ego, other), trace.actor(other), rules)
+            safe = _safe_aside(_relation(trace.actor(ego), trace.actor(other)), trace.actor(other), rules)
             dangerous &= ~_behind(trace, ego, other, safe)
         return integral(trace, dangerous, ego, other)
 

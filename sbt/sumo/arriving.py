@@ -23,6 +23,8 @@ _STRAIGHT = math.cos(0.1)
 """Cosine between the heading and the way to the end up to which that way is straight."""
 _BRAKES = 9.0
 """How hard an ego may brake (m/s^2), by SUMO's default."""
+_EARLY = 0.1
+"""Distance (m) before its end at which SUMO lets a vehicle arrive: `POSITION_EPS`."""
 _BESIDE = 1.0
 """How much farther than at its speeds one may come in a step (m); more is a jump."""
 
@@ -84,7 +86,8 @@ def last_step(sumo: Any, near: _Surroundings, ego: str, way: tuple[float, float]
     first = min(touched[0].keys() & touched[1].keys(), key=lambda name: (touched[1][name], name), default=None)
     if first is None:
         return None
-    row = float(own.x[1]), float(own.y[1]), float(own.heading[1]), fastest, (fastest - speed) / dt
+    driven = max(speed, (length - _EARLY) / dt)  # it may have been taken off the road so much before its end
+    row = float(own.x[1]), float(own.y[1]), float(own.heading[1]), driven, (driven - speed) / dt
     return LastStep(row, first, {name: others[name] for name in steps})
 
 

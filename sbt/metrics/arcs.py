@@ -1,0 +1,102 @@
+"""How rectangles that turn move between two instants: on arcs, and turning evenly."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sbt.metrics.discs import is_person
+from sbt.problem.arrays import Vector
+from sbt.problem.trace import ActorTrace
+
+__all__ = ["finer", "on_arcs", "parts_of_passing", "parts_of_turns"]
+
+_SWING = 0.3
+"""How far a corner may move in a step because its rectangle turns, before the step is divided (m)."""
+_SHORT, _PARTS = 0.1, 16
+"""Steps no longer than the first (s) are not divided; longer ones into so many parts, at most."""
+_MOST_PASSING = 64
+"""Parts of a step in which two pass each other, at most."""
+
+
+def on_arcs(
+    start: tuple[Vector, Vector, Vector], end: tuple[Vector, Vector, Vector], share: Vector, bend: float = 1.0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return (n, m) x, y and heading after shares (m,) of n steps.
+
+    A centre drives a cubic from one instant to the next, along the headings at both; with a bend of 0 the chord.
+
+    Args:
+        start: (n,) x, y (m) and heading (rad) at the begin of each step.
+        end: (n,) likewise at its end.
+        share: (m,) in [0, 1], or (n, m) of each step its own.
+        bend: share of the way from the chord to the arc.
+    """
+    (x, y, old), (to_x, to_y, new) = start, end
+    s, dx, dy = np.atleast_2d(share), to_x - x, to_y - y
+    turn = np.remainder(new - old + np.pi, 2.0 * np.pi) - np.pi
+    half = 0.5 * turn
+    length = np.hypot(dx, dy) / np.sinc(half / np.pi)  # of the arc over the chord
+    length = np.copysign(length, dx * np.cos(old + half) + dy * np.sin(old + half))[:, None]  # it may drive backwards
+    out, into = bend * s * (1.0 - s) ** 2 * length, -bend * s * s * (1.0 - s) * length
+    come = s + bend * (s * s * (3.0 - 2.0 * s) - s)
+    last = (old + turn)[:, None]
+    old = old[:, None]
+    at_x = x[:, None] + come * dx[:, None] + out * np.cos(old) + into * np.cos(last)
+    at_y = y[:, None] + come * dy[:, None] + out * np.sin(old) + into * np.sin(last)
+    return at_x, at_y, old + s * turn[:, None]
+
+
+def parts_of_turns(actors: Sequence[ActorTrace], step: float) -> int:
+    """Return into how many parts steps (s) are divided so that no corner of the actors swings far in one; a power of two.
+
+    Persons are small, and SUMO turns them at once.
+    """
+    if step <= _SHORT + 1e-9:
+        return 1
+    swing = max((_swing(part) for actor in actors for part in actor.parts or (actor,) if not is_person(part)), default=0.0)
+    parts = 1
+    while parts * _SWING < swing and parts < _PARTS:
+        parts *= 2
+    return parts
+
+
+def parts_of_passing(a: ActorTrace, b: ActorTrace) -> int:
+    """Return into how many parts steps are divided so that two pass each other in four or more of them; a power of two."""
+    way = float(np.fmax.reduce(np.hypot(np.diff(b.x - a.x), np.diff(b.y - a.y)), initial=0.0))
+    parts = 1
+    while parts * 0.25 * (a.length + b.length) < way and parts < _MOST_PASSING:
+        parts *= 2
+    return parts
+
+
+def _swing(actor: ActorTrace) -> float:
+    """Return by how much (m) a corner moves, at most, because its rectangle turns within a step."""
+    half = 0.5 * np.diff(actor.heading)
+    return float(np.hypot(actor.length, actor.width) * np.fmax.reduce(np.abs(np.sin(half)), initial=0.0))
+
+
+def finer(actor: ActorTrace, parts: int) -> ActorTrace:
+    """Return an actor with every step divided into so many parts, on arcs.
+
+    Where it was not there at an end of a step it is not between them either.
+    """
+    if parts == 1:
+        return actor
+    share, states = np.arange(parts) / parts, (actor.x, actor.y, actor.heading)
+    start, end = (tuple(v[i] for v in states) for i in (slice(-1), slice(1, None)))
+    arcs = on_arcs(start, end, share)  # type: ignore[arg-type]
+    x, y, heading = (_in_turn(v, values) for v, values in zip(arcs, states, strict=True))
+    speed, acceleration = (_in_turn(v[:-1, None] + share * np.diff(v)[:, None], v) for v in (actor.speed, actor.acceleration))
+    bodies = tuple(finer(part, parts) for part in actor.parts)
+    return ActorTrace(x, y, heading, speed, acceleration, actor.length, actor.width, bodies)
+
+
+def _in_turn(within: np.ndarray, values: Vector) -> Vector:
+    """Return the (n, m) values of n steps after another, with those of the instants (n + 1,) themselves."""
+    n, parts = within.shape
+    found = np.empty(n * parts + 1)
+    found[:-1] = within.ravel()
+    found[::parts] = values
+    return found

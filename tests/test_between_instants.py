@@ -1,0 +1,87 @@
+"""Metrics of two road users know what happens between instants: coarse traces of a drive give what fine ones give."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sbt.metrics.around import smallest_distance
+from sbt.metrics.planar import distance_min, post_encroachment_time, severity, time_behind
+from sbt.metrics.rss import rss_lateral_min
+from sbt.problem.trace import Trace
+
+Way = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
+"""(t,) times to x, y and heading."""
+
+
+def straight(x: float, y: float, heading: float, speed: float) -> Way:
+    return lambda t: (x + speed * t * math.cos(heading), y + speed * t * math.sin(heading), np.full(len(t), heading))
+
+
+def bend(radius: float, speed: float, phase: float) -> Way:
+    """To the left about the origin."""
+
+    def at(t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        angle = phase + speed / radius * t
+        return radius * np.cos(angle), radius * np.sin(angle), angle + math.pi / 2
+
+    return at
+
+
+def trace_of(ways: dict[str, Way], sizes: tuple[float, float], step: float, duration: float, offset: float = 0.0) -> Trace:
+    time = np.arange(0.0, duration + 1e-9, step)
+    x, y, heading = (np.column_stack(states) for states in zip(*(way(time + offset) for way in ways.values()), strict=True))
+    speed = np.hypot(*(np.gradient(states, step, axis=0) for states in (x, y)))
+    length, width = (np.full(len(ways), size) for size in sizes)
+    return Trace(time, tuple(ways), x, y, heading, speed, np.zeros_like(x), length, width)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.floats(5.0, 9.0), st.floats(3.0, 6.5), st.floats(-1.0, 0.0), st.floats(0.6, 1.5), st.sampled_from((0.5, 1.0)))
+def test_who_turn_side_by_side_have_no_conflict_however_coarse_the_step(radius, speed, phase, gap, step):
+    """Outlines of concentric drives never meet: the outer corner of the inner one stays within `reach` of the middle."""
+    length, width = 4.5, 1.8
+    reach = math.hypot(radius + width / 2, length / 2)
+    ways = {"ego": bend(radius, speed, phase), "co": bend(reach + gap + width / 2, speed, phase)}
+    trace = trace_of(ways, (length, width), step, 4.0)
+    assert post_encroachment_time(trace) == 10.0
+    assert time_behind(trace, other=None) == 10.0
+    assert distance_min()(trace) > 0.0
+
+
+@pytest.mark.parametrize("gap", [0.4, 1.0])
+def test_the_pet_of_a_drive_across_a_bend_is_that_of_small_steps(gap):
+    ways = {"ego": bend(6.0, 5.0, -1.0), "co": straight(6.0, -25.0, math.pi / 2, 8.0)}
+    late = {**ways, "co": lambda t: ways["co"](t - gap)}
+    fine = post_encroachment_time(trace_of(late, (4.5, 1.8), 0.02, 6.0))
+    assert 0.0 < fine < 10.0
+    for step in (0.1, 0.5, 1.0):
+        assert post_encroachment_time(trace_of(late, (4.5, 1.8), step, 6.0)) == pytest.approx(fine, abs=0.1), step
+
+
+@pytest.mark.parametrize("step", [0.1, 0.2, 0.5, 1.0])
+def test_oncoming_traffic_that_passes_between_two_instants_is_as_near_as_it_is(step):
+    ways = {"ego": straight(0.0, 0.0, 0.0, 25.0), "co": straight(150.0, 3.2, math.pi, 25.0)}
+    for offset in np.linspace(0.0, step, 5):
+        trace = trace_of(ways, (5.0, 1.8), step, 6.0, float(offset))
+        assert distance_min()(trace) == pytest.approx(1.4, abs=2e-3)
+        assert severity()(trace) == pytest.approx(1.4, abs=2e-3)
+        assert smallest_distance(trace, "ego") == pytest.approx(1.4, abs=2e-3)
+        assert rss_lateral_min()(trace) == pytest.approx(1.4 - 0.25, abs=1e-3)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.floats(-math.pi, math.pi), st.floats(-4.0, 4.0), st.floats(2.0, 20.0), st.floats(2.0, 20.0), st.floats(0.0, 0.5))
+def test_the_smallest_distance_of_straight_drives_is_that_of_small_steps(heading, aside, speed, other, offset):
+    ways = {
+        "ego": straight(-3.0 * speed, 0.0, 0.0, speed),
+        "co": straight(aside - 3.0 * other * math.cos(heading), aside - 3.0 * other * math.sin(heading), heading, other),
+    }  # fmt: skip
+    fine = distance_min()(trace_of(ways, (5.0, 1.8), 0.005, 6.0))
+    coarse = distance_min()(trace_of(ways, (5.0, 1.8), 0.5, 6.5, offset - 0.5))
+    assert coarse == pytest.approx(fine, abs=0.03 if fine else 1e-9)
