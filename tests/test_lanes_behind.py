@@ -30,7 +30,9 @@ def crossing(tmp_path_factory: pytest.TempPathFactory) -> str:
     return (folder / "net.net.xml").read_text()
 
 
-def driven(folder: Path, network: str, turn: str, length: float, depart: float, loop: Loop = step_until_over) -> Trace:
+def driven(
+    folder: Path, network: str, turn: str, length: float, depart: float, loop: Loop = step_until_over, step: str = "0.1"
+) -> Trace:
     """A bus that turns; the ego, which stands on the other side, sees it from its departure on."""
     lane = {"right": 0, "straight": 0, "left": 1}[turn]
     vehicles = f'<vType id="longer" length="{length}" width="2.5" sigma="0" maxSpeed="8"/>'
@@ -38,7 +40,7 @@ def driven(folder: Path, network: str, turn: str, length: float, depart: float, 
     vehicles += '<vType id="slow" maxSpeed="0.01"/>'
     vehicles += vehicle("ego", "nm ms", "slow", depart=depart, departPos=150, departSpeed=0)
     (own := folder / f"{depart:g}").mkdir()
-    return simulation(own, network, vehicles, loop, 20.0, step_length="0.1")({}, 1)
+    return simulation(own, network, vehicles, loop, 20.0, step_length=step)({}, 1)
 
 
 def body(actor: ActorTrace, k: int) -> np.ndarray:
@@ -93,6 +95,26 @@ def test_a_body_that_was_moved_is_on_the_lanes_behind_it(tmp_path: Path, crossin
     assert 15 < back < 30
     for k in range(back, back + 5):
         assert beside(body(bus, k), line).max() < 0.6, "parts are chords of the turn"
+
+
+@pytest.mark.parametrize("step", ["0.5", "1"])
+@pytest.mark.parametrize("turn", AFTER)
+def test_a_body_is_on_the_lanes_however_long_the_step(tmp_path: Path, crossing: str, turn: str, step: str):
+    """It followed the chords between its fronts, a metre beside its lane in a turn."""
+    bus = driven(tmp_path, crossing, turn, 18.0, 0.0, step=step).actor("o")
+    lane, after = {"right": 0, "straight": 0, "left": 1}[turn], AFTER[turn]
+    inside, lanes = crossing.split(f'from="{BEFORE}" to="{after}" fromLane="{lane}"')[1].split('via="')[1].split('"')[0], []
+    while inside:
+        lanes.append(inside)
+        onwards = crossing.split(f'from="{inside.rpartition("_")[0]}" to="{after}"')[1].split("/>")[0]
+        inside = onwards.split('via="')[1].split('"')[0] if "via" in onwards else ""
+    turned = middle(crossing, [f"{BEFORE}_{lane}", *lanes, f"{after}_{lane}"])
+    changed = middle(crossing, [f"{after}_{1 - lane}"])  # it may change lanes behind the turn
+    for part in bus.parts:
+        along = 0.5 * part.length * np.stack([np.cos(part.heading), np.sin(part.heading)], axis=-1)
+        joints = np.stack([part.x, part.y], axis=-1) - along
+        joints = joints[np.isfinite(joints[:, 0])]
+        assert np.minimum(beside(joints, turned), beside(joints, changed)).max() < 0.2
 
 
 def test_beyond_the_begin_of_its_route_a_body_is_straight(tmp_path: Path, crossing: str):

@@ -24,6 +24,8 @@ _PART = 5.0
 _MOST_PARTS = 16
 _SPACING = 0.5
 """Distance of the stored points of a path (m)."""
+_SAGITTA = 0.05
+"""How far (m) a way of one step may bend beside its chord before the lanes between are asked for."""
 _JUMP = 3.0
 """Distance (m) beyond what the speed explains, from which on a vehicle has been moved and not driven."""
 
@@ -114,6 +116,20 @@ class TrailingBody:
             self._paths.append(_Path())  # backwards (in a tight turn the front drives against the chord): straight
             return
         path.extend(before, _SPACING)
+        if not changed and abs(u * dy - v * dx) > 8.0 * _SAGITTA:  # how far the way bends beside the chord
+            for point in self._between(before, front, math.hypot(dx, dy)):
+                path.extend(point, 1e-3)
+
+    def _between(self, before: Point, front: Point, chord: float) -> list[Point]:
+        """Return the points of the lanes between two fronts, the first one first."""
+        found, last, covered = list[Point](), front, 0.0
+        for point in self._behind(front):
+            covered += math.dist(point, last)
+            if covered >= chord or math.dist(point, front) >= chord:
+                break
+            found.append(point)
+            last = point
+        return found[::-1]
 
     def _begin(self, front: Point) -> None:
         """Begin a path that ends at the front: what is behind it has not been seen."""
