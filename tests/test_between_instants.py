@@ -64,6 +64,19 @@ def test_the_pet_of_a_drive_across_a_bend_is_that_of_small_steps(gap):
         assert post_encroachment_time(trace_of(late, (4.5, 1.8), step, 6.0)) == pytest.approx(fine, abs=0.1), step
 
 
+@pytest.mark.parametrize("known", [lambda k: (k <= 25) | (k % 5 == 0), lambda k: (k < 31) | (k > 44), lambda k: k % 3 != 1])
+def test_the_pet_of_a_recording_with_gaps_is_in_seconds(known):
+    """It was in steps of the mean length: 1.1 s for .66 s."""
+    ways = {"ego": straight(97.5, 0.0, 0.0, 20.0), "co": straight(130.0, -52.5, math.pi / 2, 20.0)}
+    whole = trace_of(ways, (5.0, 1.8), 0.1, 5.0)
+    k = np.flatnonzero(known(np.arange(51)))
+    states = (v[k] for v in (whole.x, whole.y, whole.heading, whole.speed, whole.acceleration))
+    gaps = Trace(whole.time[k], whole.actors, *states, whole.length, whole.width)
+    assert np.ptp(np.diff(gaps.time)) > 0.05
+    for found in (post_encroachment_time(gaps), time_behind(gaps, other=None)):
+        assert found == pytest.approx((50.0 - 0.9) / 20.0 - (130.9 + 5.0 - 100.0) / 20.0, abs=1e-3)
+
+
 @pytest.mark.parametrize("step", [0.1, 0.2, 0.5, 1.0])
 def test_oncoming_traffic_that_passes_between_two_instants_is_as_near_as_it_is(step):
     ways = {"ego": straight(0.0, 0.0, 0.0, 25.0), "co": straight(150.0, 3.2, math.pi, 25.0)}

@@ -267,3 +267,15 @@ def test_collisions_in_a_file_without_heights_are_told_to_be_in_the_plane(tmp_pa
         assert result.exit_code == 0
         assert json.loads(result.stdout)["heights"] is not told
         assert ("no heights (z)" in result.stderr) is told
+
+
+def test_sizes_that_a_file_does_not_have_are_told(tmp_path: Path) -> None:
+    """A bicycle was a car of 5 m, and in collisions, without a word."""
+    sized = [one | {"length": 1.6, "width": 0.6} for one in DRIVE]
+    name = str(DRIVE[0]["id"])
+    half = [one if one["id"] == name else both for one, both in zip(DRIVE, sized, strict=True)]
+    users = len({one["id"] for one in DRIVE})
+    for k, (rows, told) in enumerate(((DRIVE, users), (sized, 0), (half, 1))):
+        result = CliRunner().invoke(app, ["metrics", str(written(tmp_path, f"{k}.xml", as_xml(rows))), "--json"])
+        assert (result.exit_code, json.loads(result.stdout)["assumed_sizes"]) == (0, told)
+        assert (f"{told} of {users} vehicles have no length or width" in result.stderr) is bool(told)

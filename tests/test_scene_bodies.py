@@ -108,6 +108,22 @@ def test_who_begins_by_a_pose_is_on_the_level_of_its_lane(tmp_path: Path) -> Non
         assert SumoSimulation(str(crossing(tmp_path, z)), scene, 9.0, 0.1)({}, 1).ended == ended
 
 
+@pytest.mark.parametrize("x", [0.0, 800.0, -800.0])
+def test_who_is_far_outside_a_network_with_bridges_is_on_the_level_of_its_lane(tmp_path: Path, x: float) -> None:
+    """SUMO leaves the height out there."""
+
+    class Driving:
+        def act(self, t: float, own: State, others: tuple[State, ...]) -> Action:
+            return Action(pose=(own.x, own.y + 1.0, own.heading))
+
+    def scene(values: Any, ego: Any, rng: Any) -> Scene:
+        beside = Actor("co", ("sn",), 0, 90.0, 0.0, Driving(), pose=(x + 4.5, 60.0, 0.5 * math.pi))
+        return Scene((Actor("ego", ("we",), 0, 50.0, 10.0, Looking(set())), beside))
+
+    trace = SumoSimulation(str(crossing(tmp_path, 6.0)), scene, 3.0, 0.1)({}, 1)
+    assert (trace.ended, len(trace.time)) == ("duration", 31)
+
+
 def bus_in_a_bend(path: Path, *, driven: bool, **settings: Any) -> SumoSimulation:
     """A bus on the outer lane passes a car that stands on the inner one, at the bend."""
 

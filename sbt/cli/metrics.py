@@ -46,6 +46,9 @@ def metrics(
     if recording.z is None and touching:
         what = f"{touching} of {len(rows)} rows have a collision, and '{file}' has no heights (z)"
         print(f"note: {what}: who is on a bridge touches who is below it in the plane", file=sys.stderr)
+    if recording.assumed and rows:
+        what = f"{recording.assumed} of {recording.kinds.count('vehicle')} vehicles have no length or width in '{file}'"
+        print(f"note: {what}, and are taken for {length:g} m x {width:g} m (--length, --width)", file=sys.stderr)
     columns = ["ego", "other", "begin", "end", *(metric.name for metric in measured)]
     if out is not None:
         try:
@@ -56,7 +59,8 @@ def metrics(
     if as_json:
         units = {metric.name: metric.unit for metric in measured}
         print_json({"file": str(file), "road_users": len(recording.names), "steps": len(recording.time),
-                    "heights": recording.z is not None, "within": within, "units": units, "pairs": rows})  # fmt: skip
+                    "heights": recording.z is not None, "assumed_sizes": recording.assumed, "within": within, "units": units,
+                    "pairs": rows})  # fmt: skip
     elif out is None:
         _write(sys.stdout, columns, rows)
     else:

@@ -10,7 +10,7 @@ from sbt.metrics.discs import is_person
 from sbt.problem.arrays import Vector
 from sbt.problem.trace import ActorTrace
 
-__all__ = ["finer", "on_arcs", "parts_of_passing", "parts_of_turns"]
+__all__ = ["at_times", "finer", "on_arcs", "parts_of_passing", "parts_of_turns"]
 
 _SWING = 0.3
 """How far a corner may move in a step because its rectangle turns, before the step is divided (m)."""
@@ -78,25 +78,29 @@ def _swing(actor: ActorTrace) -> float:
 
 
 def finer(actor: ActorTrace, parts: int) -> ActorTrace:
-    """Return an actor with every step divided into so many parts, on arcs.
-
-    Where it was not there at an end of a step it is not between them either.
-    """
+    """Return an actor with every step divided into so many parts, on arcs."""
     if parts == 1:
         return actor
-    share, states = np.arange(parts) / parts, (actor.x, actor.y, actor.heading)
-    start, end = (tuple(v[i] for v in states) for i in (slice(-1), slice(1, None)))
-    arcs = on_arcs(start, end, share)  # type: ignore[arg-type]
-    x, y, heading = (_in_turn(v, values) for v, values in zip(arcs, states, strict=True))
-    speed, acceleration = (_in_turn(v[:-1, None] + share * np.diff(v)[:, None], v) for v in (actor.speed, actor.acceleration))
-    bodies = tuple(finer(part, parts) for part in actor.parts)
+    at = np.arange((len(actor.x) - 1) * parts + 1)
+    return _between(actor, at // parts, at % parts / parts)
+
+
+def at_times(actor: ActorTrace, time: Vector, at: Vector) -> ActorTrace:
+    """Return an actor, known at times (t,), at others (n,) within them, on arcs; (s)."""
+    step = np.clip(np.searchsorted(time, at, side="right") - 1, 0, len(time) - 2)
+    return _between(actor, step, (at - time[step]) / (time[step + 1] - time[step]))
+
+
+def _between(actor: ActorTrace, step: np.ndarray, share: Vector) -> ActorTrace:
+    """Return an actor after shares (n,) of steps (n,); between two instants it is there where it is at both."""
+    here, end = step + (share >= 1.0), np.minimum(step + 1, len(actor.x) - 1)
+    within = (share > 0.0) & (share < 1.0)
+    states = actor.x, actor.y, actor.heading
+    start, stop = (tuple(v[k] for v in states) for k in (step, end))
+    arcs = on_arcs(start, stop, share[:, None])
+    x, y, heading = (np.where(within, arc[:, 0], v[here]) for arc, v in zip(arcs, states, strict=True))
+    speed, acceleration = (
+        np.where(within, v[step] + share * (v[end] - v[step]), v[here]) for v in (actor.speed, actor.acceleration)
+    )  # fmt: skip
+    bodies = tuple(_between(part, step, share) for part in actor.parts)
     return ActorTrace(x, y, heading, speed, acceleration, actor.length, actor.width, bodies)
-
-
-def _in_turn(within: np.ndarray, values: Vector) -> Vector:
-    """Return the (n, m) values of n steps after another, with those of the instants (n + 1,) themselves."""
-    n, parts = within.shape
-    found = np.empty(n * parts + 1)
-    found[:-1] = within.ravel()
-    found[::parts] = values
-    return found

@@ -81,6 +81,8 @@ class Recording:
     """(n,) height, of the front bumper of a vehicle (m), NaN where it is not known; None where the file has none."""
     rise: Vector | None = None
     """(n,) of the road, along the heading (m/m), 0 where it is not known; None where the file has no heights."""
+    assumed: int = 0
+    """How many of the vehicles have no size in the file."""
 
     @cached_property
     def stacked(self) -> bool:
@@ -157,6 +159,7 @@ def recording_of_columns(path: Path, ids: Any, kinds: Any, columns: dict[str, An
         np.where(np.isnan(given), np.where(person, small, big), given)
         for given, small, big in zip((data["length"][start[:-1]], data["width"][start[:-1]]), PERSON_SIZE, size, strict=True)
     )
+    assumed = int((np.isnan(data["length"] + data["width"])[start[:-1]] & ~person).sum())
     heading = np.radians(90.0 - data["angle"])
     half = 0.5 * lengths[user]
     acceleration = _differences(data["speed"], time[step], start)
@@ -166,7 +169,7 @@ def recording_of_columns(path: Path, ids: Any, kinds: Any, columns: dict[str, An
     return Recording(
         tuple(users.tolist()), time, start, step.astype(np.int64), data["x"] - half * np.cos(heading),
         data["y"] - half * np.sin(heading), heading, data["speed"], acceleration, lengths, widths,
-        tuple(np.array(_KINDS)[person.astype(int)].tolist()), *((None, None) if np.isnan(z).all() else (z, rise)),
+        tuple(np.array(_KINDS)[person.astype(int)].tolist()), *((None, None) if np.isnan(z).all() else (z, rise)), assumed=assumed,
     )  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from sbt.metrics.arcs import finer, parts_of_turns
+from sbt.metrics.arcs import at_times, finer, parts_of_turns
 from sbt.metrics.around import around, first_contacts
 from sbt.metrics.geometry import (
     Rectangles,
@@ -39,6 +39,8 @@ _DIVISIONS = (16, 8, 8)
 """The PET is accurate to the step of the trace divided by the product of these."""
 _FINEST = 64
 """Parts of a step, at most, in which shifts are looked for; a power of two, and a divisor of that product."""
+_EVEN = 1e-3
+"""Share of a step by which steps may differ before they are taken to be uneven: recorded traffic, with gaps."""
 _STRIDE = 5
 """Shifts of which the middle one tells whether any of them may matter; an odd number."""
 _SLACK = 1e-6
@@ -164,13 +166,17 @@ def time_behind(
 
 
 def _step(trace: Trace) -> float:
-    """Return the step of a trace (s)."""
+    """Return the mean step of a trace (s)."""
     return float(trace.time[-1] - trace.time[0]) / (len(trace.time) - 1)
 
 
 def _on_their_ways(trace: Trace, actors: list[ActorTrace]) -> tuple[list[ActorTrace], float]:
-    """Return actors at instants between which none of them turns far, and the time between these (s)."""
-    step = _step(trace)
+    """Return actors at instants of even distance, between which none of them turns far, and the time between these (s)."""
+    steps, step = np.diff(trace.time), _step(trace)
+    if np.ptp(steps) > _EVEN * step:
+        count = min(round(_step(trace) / float(steps.min()) * len(steps)), _FINEST * len(steps))
+        at = np.linspace(trace.time[0], trace.time[-1], count + 1)
+        actors, step = [at_times(actor, trace.time, at) for actor in actors], float(at[1] - at[0])
     parts = parts_of_turns(actors, step)
     return [finer(actor, parts) for actor in actors], step / parts
 

@@ -23,7 +23,8 @@ __all__ = ["AppearanceMonitor", "refuse_overlap_at_start"]
 _MAX_BRAKING = 9.0
 """Deceleration that tyres allow on a dry road (m/s^2); SUMO's default `emergencyDecel` too."""
 _REMEDY = (
-    "let it depart elsewhere or more slowly, and leave SUMO's insertion checks on (neither it nor an option sets them to none)"
+    "let it depart (or a loop move it) elsewhere or more slowly, and leave SUMO's insertion checks on (neither it nor an option "
+    "sets them to none)"
 )
 
 

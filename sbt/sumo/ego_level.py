@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -69,7 +69,7 @@ class EgoLevel:
         SUMO puts who is moved onto the nearest lane in the plane, whatever its height.
         """
         at = self._sumo.vehicle.getPosition3D(name)
-        if abs(at[2] - self._last[name][1]) >= LEVEL_HEIGHT:
+        if abs(_height(at) - self._last[name][1]) >= LEVEL_HEIGHT:
             return False
         return self._keep(name, at, person=False) != ""
 
@@ -81,7 +81,7 @@ class EgoLevel:
 
     def _at_last(self, name: str, at: Place) -> tuple[Place, str]:
         """Return a place (x, y, z) with the height of the last road, and that road; "" where it is not known."""
-        road, z = self._last.get(name, ("", at[2]))
+        road, z = self._last.get(name, ("", _height(at)))
         return (at[0], at[1], z), road
 
     def enter(self, ego: State, at: Place, off: Collection[str], t: float, *, person: bool) -> None:
@@ -137,7 +137,7 @@ class EgoLevel:
         person, place = VEHICLE in variables, variables[POSITION]
         if math.isnan(place[2]):
             return False
-        astray = not person and abs(self._sumo.vehicle.getPosition3D(name)[2] - place[2]) >= LEVEL_HEIGHT
+        astray = not person and abs(_height(self._sumo.vehicle.getPosition3D(name)) - place[2]) >= LEVEL_HEIGHT
         return ground.is_below(name, place, person=person, off=astray or not road_of(self._sumo, name, person=person))
 
     def _note(self, roads: tuple[str, str], name: str, variables: Mapping[int, Any], *, person: bool) -> None:
@@ -150,3 +150,8 @@ class EgoLevel:
             both = f"'{roads[0]}' and '{roads[1]}'"
             why = f"{both} cross without a junction and are taken for a bridge: heights (z) of nodes decide it"
             self._notes[roads] = f"{OTHER_LEVEL}{at}: bodies overlap by {found[1]:.2f} m in the plane, but {why}"
+
+
+def _height(at: Sequence[float]) -> float:
+    """Return z (m) of a place, which SUMO leaves out, for NaN here, far outside the network."""
+    return at[2] if len(at) > 2 else math.nan
