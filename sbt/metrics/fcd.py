@@ -165,11 +165,13 @@ def recording_of_columns(path: Path, ids: Any, kinds: Any, columns: dict[str, An
     acceleration = _differences(data["speed"], time[step], start)
     acceleration = np.where(np.isnan(data["acceleration"]), acceleration, data["acceleration"])
     z, slope = (data.get(name, np.full(len(order), np.nan)) for name in ("z", "slope"))
+    flat = bool(np.isnan(z).all())
     rise = np.tan(np.radians(np.nan_to_num(slope)))
     return Recording(
         tuple(users.tolist()), time, start, step.astype(np.int64), data["x"] - half * np.cos(heading),
         data["y"] - half * np.sin(heading), heading, data["speed"], acceleration, lengths, widths,
-        tuple(np.array(_KINDS)[person.astype(int)].tolist()), *((None, None) if np.isnan(z).all() else (z, rise)), assumed=assumed,
+        tuple(np.array(_KINDS)[person.astype(int)].tolist()),
+        None if flat else z, None if flat else rise, assumed,
     )  # fmt: skip
 
 
