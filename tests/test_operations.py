@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 
 import pytest
+from test_evidence import net, vehicle
 
 import sbt
 from sbt.config.load import load
@@ -155,3 +156,41 @@ def test_a_report_says_what_it_leaves_out_and_leaves_no_old_figures(tmp_path: Pa
     assert "The figures of the metamodel are left out" in page.read_text()
     assert not figure.exists()
     assert (figure.parent / "mine.svg").exists(), "not one of its figures"
+
+
+@pytest.mark.sumo
+@pytest.mark.parametrize("executor", [{"kind": "serial"}, {"kind": "local", "workers": 1}])
+@pytest.mark.parametrize("gone", [False, True])
+def test_no_row_is_of_traffic_that_was_edited_while_the_campaign_ran(tmp_path: Path, executor: dict[str, object], gone: bool):
+    """Runs load SUMO's files anew: what was run before is kept, and the rows are the same once the file is put back."""
+    (tmp_path / "a.net.xml").write_text(net({"road": [(0.0, 0.0), (900.0, 0.0)]}))
+    traffic = tmp_path / "traffic.rou.xml"
+    lead = vehicle("lead", "road", "slow", departPos=300)
+    traffic.write_text(f'<routes><vType id="slow" sigma="0" maxSpeed="5"/>{lead}</routes>')
+    ego = vehicle("ego", "road", "own", departPos=20, departSpeed="${v}")
+    (tmp_path / "ego.rou.xml").write_text(f'<routes><vType id="own" sigma="0" maxSpeed="30"/>{ego}</routes>')
+    (tmp_path / "scenario.yaml").write_text(ROAD)
+    before = traffic.read_text()
+
+    def edit(progress: sbt.Progress) -> None:
+        if progress.done >= 8:
+            traffic.unlink(missing_ok=True) if gone else traffic.write_text(before.replace("300", "200"))
+
+    asked = {"campaign": "coverage", "budget": 24, "batch": 6, "seed": 5, "executor": executor, "report": False}
+    with pytest.raises(InputError, match=r"SUMO's files must stay .* but changed: .*traffic.rou.xml; put it back"):
+        sbt.run(scenario=tmp_path / "scenario.yaml", store=tmp_path / "s", progress=edit, **asked)
+    assert 0 < len(sbt.open(tmp_path / "s").frame) < 24
+    traffic.write_text(before)
+    whole = sbt.run(scenario=tmp_path / "scenario.yaml", store=tmp_path / "s", **asked)
+    undisturbed = sbt.run(scenario=tmp_path / "scenario.yaml", store=tmp_path / "t", **asked)
+    columns = [name for name in whole.frame if name != "seconds"]
+    assert whole.frame[columns].equals(undisturbed.frame[columns])
+
+
+ROAD = """sumo: {net: a.net.xml, routes: [traffic.rou.xml, ego.rou.xml]}
+inputs: {v: {min: 5, max: 20}}
+ego: {id: ego, may_leave: true}
+duration: 3
+metrics: [distance_min]
+requirement: {metric: distance_min, critical: [-.inf, 200]}
+"""

@@ -34,7 +34,7 @@ from sbt.execution.spec import ScenarioSpec
 from sbt.execution.starting import start_apart
 from sbt.execution.streams import open_missing
 from sbt.execution.worker import run_at_levels
-from sbt.plugins import contents_read
+from sbt.plugins import check_loaded_anew, contents_read
 from sbt.problem.outcome import Job, Outcome, Status
 from sbt.problem.scenario import LogicalScenario
 from sbt.processes import scratch
@@ -310,12 +310,20 @@ def _prepare(folder: str, workers: int) -> Mapping[str, str]:
     marks, deadline = Path(folder, _MARKS), time.monotonic() + 20.0
     while len(os.listdir(marks)) < workers and time.monotonic() < deadline:  # noqa: PTH208  (fast)
         time.sleep(0.005)
+    return _contents(folder)
+
+
+@cache
+def _contents(folder: str) -> Mapping[str, str]:
+    """Return what is in the files that this worker has read for the scenario, as it was when it was first asked."""
+    del folder
     return contents_read()
 
 
 def _run_chunk(folder: str, jobs: list[Job]) -> list[Outcome]:
     """Run jobs in a worker and record which are in progress."""
     outcomes = run_at_levels(partial(_scenario, folder), jobs, partial(_mark, folder))
+    check_loaded_anew(_contents(folder))
     for outcome in outcomes if _limit(folder) else ():
         if outcome.reason.startswith(_TOO_LARGE):  # what earlier runs left may be to blame: tried again alone, as after a death
             _mark(folder, (outcome.index,))

@@ -6,7 +6,7 @@ import os
 import sys
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Protocol, Self, runtime_checkable
@@ -15,6 +15,7 @@ from sbt import interruption
 from sbt.execution.spec import ScenarioSpec
 from sbt.execution.streams import open_missing
 from sbt.execution.worker import run_at_levels, run_job
+from sbt.plugins import check_loaded_anew, contents_read
 from sbt.problem.outcome import Job, Outcome
 from sbt.problem.scenario import Batched
 
@@ -88,10 +89,12 @@ class SerialExecutor:
 
     def __init__(self, spec: ScenarioSpec, timeout: float | None = None):
         self._scenarios = tuple(level.resolve().limited(timeout) for level in spec.levels)
+        self._contents: Mapping[str, str] = {}
 
     def __enter__(self) -> Self:
         """Return the executor."""
         open_missing()
+        self._contents = contents_read()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -106,6 +109,7 @@ class SerialExecutor:
         """Yield the outcomes in order, those of runs that take no time together.
 
         Raises:
+            InputError: a file that runs load anew has changed.
             KeyboardInterrupt: Ctrl-C, after the run that was at work at the latest.
         """
         place, depth = Path.cwd(), sys.getrecursionlimit()
@@ -115,6 +119,7 @@ class SerialExecutor:
             with interruption.handled():  # which tells Ctrl-C from a KeyboardInterrupt that the scenario's code raises
                 outcomes = self._together(queue) if together else self._alone(queue)
             _restore(place, depth)
+            check_loaded_anew(self._contents)
             yield outcomes
 
     def _together(self, queue: deque[Job]) -> list[Outcome]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 import os
+import re
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -25,8 +26,8 @@ from sbt.plugins.approval import check_approved, modules_of, named_by
 from sbt.plugins.source import FromSource, import_from_source
 
 __all__ = [
-    "KINDS", "OBJECT", "Objects", "Scope", "contents_read", "forget_changed", "forget_files", "kept", "load", "names", "newer",
-    "noted", "read_files",
+    "KINDS", "OBJECT", "Objects", "Scope", "check_loaded_anew", "contents_read", "forget_changed", "forget_files", "kept", "load",
+    "names", "newer", "noted", "read_files",
 ]  # fmt: skip
 
 OBJECT = "object:"
@@ -40,6 +41,7 @@ KINDS = ("scenarios", "sources", "metamodels", "acquisitions", "metrics", "contr
 _LOCK = threading.Lock()
 _LARGE = 2**22
 """Size (bytes) up to which the contents of files are compared."""
+_SUMO_FILES = re.compile(r"\.(xml|sumocfg)(\.gz)?$")
 _SHORT = 8
 """Digits of a hash that people are shown."""
 _USER = "sbt_user_"
@@ -99,6 +101,24 @@ def contents_read(*, whole: bool = False) -> dict[str, str]:
         whole: of large ones too it is a hash of what is in them.
     """
     return {str(path): _content(path, whole=whole) for path in read_files()}
+
+
+def check_loaded_anew(contents: Mapping[str, str]) -> None:
+    """Check that SUMO's files, which runs load anew, are what they were when a campaign began.
+
+    Args:
+        contents: of the files as they were then (`contents_read`).
+
+    Raises:
+        InputError: one has changed, or is not there any more.
+    """
+    if all(_stamp(path) == state for path, state in _stamps.items()):
+        return
+    now = contents_read()
+    changed = [path for path, was in contents.items() if _SUMO_FILES.search(path) and now.get(path) != was]
+    if changed:
+        rule = "SUMO's files must stay as they are while a campaign runs, as its runs load them"
+        raise InputError(f"{rule}, but changed: {', '.join(sorted(changed))}; put it back and run again, or choose another store")
 
 
 def _content(path: Path, *, whole: bool = False) -> str:
