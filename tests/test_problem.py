@@ -122,6 +122,22 @@ def test_maps_of_an_integer_input_invert_exactly(name):
     assert np.exp(p.log_density(k)).sum() == pytest.approx(1.0, rel=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("low", "high", "distribution"),
+    [
+        (0, 20, sbt.Exponential(4.0)), (0, 10, sbt.Triangular(0.0, 3.0, 10.0)), (0, 30, sbt.LogNormal(1.0, 1.0)),
+        (-3, 9, sbt.Normal(0.0, 1.0)),
+    ],
+)
+def test_a_whole_number_at_an_end_of_its_distribution_has_the_score_of_its_cell(low: int, high: int, distribution: Distribution):
+    """It was that of the end itself, -inf, which ended estimations."""
+    p = Parameter("n", low, high, kind="integer", distribution=distribution)
+    k = np.arange(low, high + 1.0)
+    np.testing.assert_array_equal(p.from_normal(p.to_normal(k)), k)
+    mass = np.exp(p.log_density(k))
+    np.testing.assert_allclose(stats.norm.cdf(p.to_normal(k)), np.cumsum(mass) - 0.5 * mass, rtol=1e-6)
+
+
 @pytest.mark.parametrize("name", LAWS)
 def test_density_of_an_input_integrates_to_one_and_is_the_slope_of_its_law(name):
     p = LAWS[name]

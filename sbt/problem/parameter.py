@@ -286,23 +286,28 @@ class Parameter:
 
     def to_normal(self, x: Vector) -> Vector:
         """Map a value to its standard-normal score (integers and choices: of their cell's middle)."""
-        low, high = self._support
         if self.choices:
             k = np.clip(np.asarray(x), self.low, self.high).astype(np.intp)
             middle = 0.5 * self.shares[k]
             below = np.concatenate([[0.0], np.cumsum(self.shares)])[k] + middle
-            above = np.concatenate([np.cumsum(self.shares[::-1])[::-1], [0.0]])[k + 1] + middle
-        elif self.truncated is None:
-            below, above = (x - low) / (high - low), (high - x) / (high - low)
-        else:
-            below, above = self.truncated.cdf(x), self.truncated.sf(x)
-        return np.where(below <= above, ndtri(below), -ndtri(above))
+            return _score(below, np.concatenate([np.cumsum(self.shares[::-1])[::-1], [0.0]])[k + 1] + middle)
+        if self.truncated is None or not self.discrete:
+            return _score(*self._beside(x))
+        x = np.clip(np.asarray(x, dtype=np.float64), self.low, self.high)
+        return _score(*(0.5 * (a + b) for a, b in zip(self._beside(x - 0.5), self._beside(x + 0.5), strict=True)))
+
+    def _beside(self, x: Vector) -> tuple[Vector, Vector]:
+        """Return the probabilities (n,) below and above a number, of its range."""
+        low, high = self._support
+        if self.truncated is None:
+            return (x - low) / (high - low), (high - x) / (high - low)
+        return self.truncated.cdf(x), self.truncated.sf(x)
 
     def cell(self, x: Vector) -> tuple[Vector, Vector]:
         """Return the standard-normal scores (n,) between which the whole number x is taken; that of the range next to others."""
         x = np.clip(np.asarray(x, dtype=np.float64), self.low, self.high)
-        lower = np.where(x <= self.low, -np.inf, self.to_normal(x - 0.5))
-        return lower, np.where(x >= self.high, np.inf, self.to_normal(x + 0.5))
+        lower = np.where(x <= self.low, -np.inf, _score(*self._beside(x - 0.5)))
+        return lower, np.where(x >= self.high, np.inf, _score(*self._beside(x + 0.5)))
 
     def log_density(self, x: Vector) -> Vector:
         """Return (n,) log density of the value, log mass for integers and choices, -inf outside the range."""
@@ -325,3 +330,9 @@ class Parameter:
         upper = self.truncated.sf(x - 0.5) - self.truncated.sf(x + 0.5)
         lower = self.truncated.cdf(x + 0.5) - self.truncated.cdf(x - 0.5)
         return np.where(self.truncated.cdf(x) > 0.5, upper, lower)
+
+
+def _score(below: Vector, above: Vector) -> Vector:
+    """Return standard-normal scores (n,) from the probabilities below and above; at an end of the range the farthest one."""
+    z = np.where(below <= above, ndtri(below), -ndtri(above))
+    return np.clip(z, -_FARTHEST_SCORE, _FARTHEST_SCORE)
