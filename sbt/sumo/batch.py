@@ -22,6 +22,7 @@ from sbt.problem.trace import Trace
 from sbt.sumo.actors import Scene
 from sbt.sumo.insertion import insert, verify
 from sbt.sumo.replicas import id_prefix
+from sbt.sumo.resetting import why_fresh
 from sbt.sumo.session import Setup, session, unwrapped
 from sbt.sumo.sumo_run import SumoRun
 
@@ -95,7 +96,8 @@ def _simulate_in_replicas(
 ) -> None:
     """Add to `results` the traces of the runs that can share a simulation: none where roads are on different levels.
 
-    Which roads pass over each other cannot be seen where copies of the network lie on it.
+    Runs that need a load of their own (`sbt.sumo.resetting`) are left out. Which roads pass over each other cannot be seen where
+    copies of the network lie on it.
     """
     if not simulation.one_level:
         return
@@ -107,8 +109,12 @@ def _simulate_in_replicas(
     shared = {
         index: scene
         for index, scene in scenes.items()
-        if simulation.setup(scene, REPLICAS) == setup and all(actor.pose is None for actor in scene.actors)
+        if simulation.setup(scene, REPLICAS) == setup
+        and all(actor.pose is None for actor in scene.actors)
+        and not why_fresh(setup.net, setup.options, scene.actors)
     }
+    if not shared:
+        return
     with session().run(setup, 0, "replicas") as sumo:
         _step_until_done(sumo, simulation, shared, results, at_work)
 

@@ -27,6 +27,8 @@ _KEEP_ROUTE = 2
 _OBSTACLE_COLOR = (90, 90, 90, 255)
 _WAITING_TIME = 1e6
 """Duration of the waiting stage of a person that its controller moves (s): longer than any run."""
+_NOW = -3
+"""SUMO's departure in the next step."""
 _END_OF_EDGE = -1.0
 """Arrival position at the end of the last edge."""
 
@@ -50,7 +52,7 @@ def insert(sumo: Any, scene: Scene, prefix: str = "") -> None:
     for actor in scene.actors:
         name, position, speed = prefix + actor.name, float(actor.position), float(actor.speed)
         if actor.person:
-            sumo.person.add(name, prefix + actor.route[0], position, typeID=type_name(actor))
+            unwrapped(sumo, "person", "add")(name, prefix + actor.route[0], position, _NOW, type_name(actor))
             registry.inserted(name, "person")
             if actor.pose is None:
                 sumo.person.appendWalkingStage(name, [prefix + edge for edge in actor.route], _END_OF_EDGE, speed=speed)

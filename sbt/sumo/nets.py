@@ -16,7 +16,7 @@ from sbt.plugins import kept, noted
 from sbt.problem.arrays import Points
 from sbt.sumo.places import made_here
 
-__all__ = ["Lane", "Roads", "lanes", "net_file", "nets_folder", "pavements", "roads"]
+__all__ = ["Lane", "Roads", "lanes", "net_file", "nets_folder", "opened", "pavements", "roads"]
 
 
 class Lane(NamedTuple):
@@ -86,7 +86,7 @@ def lanes(net: str) -> tuple[Lane, ...]:
     path = net_file(net)
     found: list[Lane] = []
     function = ""
-    with _opened(path) as file:
+    with opened(path) as file:
         for event, element in ET.iterparse(file, events=("start", "end")):
             if event == "start":
                 function = element.get("function", "") if element.tag == "edge" else function
@@ -101,8 +101,8 @@ def lanes(net: str) -> tuple[Lane, ...]:
 @kept
 def pavements(file: str) -> dict[str, Points]:
     """Return the (n, 2) shape of the rightmost lane of every edge of a network file, where people walk, by the edge's id."""
-    with _opened(Path(file)) as opened:
-        rightmost = {e.attrib["id"][:-2]: e.attrib["shape"] for e in ET.parse(opened).iter("lane") if e.get("index") == "0"}
+    with opened(Path(file)) as net:
+        rightmost = {e.attrib["id"][:-2]: e.attrib["shape"] for e in ET.parse(net).iter("lane") if e.get("index") == "0"}
     return {
         edge: np.array([[float(v) for v in pair.split(",")[:2]] for pair in shape.split()]) for edge, shape in rightmost.items()
     }
@@ -124,7 +124,7 @@ def roads(net: Path) -> Roads:
 
     parser = xml.parsers.expat.ParserCreate()
     parser.StartElementHandler = start
-    with _opened(net) as file:
+    with opened(net) as file:
         parser.ParseFile(file)
     return found
 
@@ -147,7 +147,7 @@ def _lane(element: ET.Element, function: str) -> list[Lane]:
     return [Lane(tuple((p[0], p[1]) for p in points), float(element.get("width", "3.2")), kind, height)]
 
 
-def _opened(path: Path) -> Any:
+def opened(path: Path) -> Any:
     """Open a file, which may be gzipped whatever its name is."""
     with path.open("rb") as file:
         zipped = file.read(2) == b"\x1f\x8b"
@@ -165,7 +165,7 @@ def _check_well_formed(path: Path) -> None:
     parser = xml.parsers.expat.ParserCreate()
     parser.StartElementHandler = start
     try:
-        with _opened(path) as file:
+        with opened(path) as file:
             parser.ParseFile(file)
     except (xml.parsers.expat.ExpatError, OSError, EOFError) as error:
         raise InputError(f"a network must be well-formed XML, but {path} is not: {error}") from None

@@ -5,7 +5,8 @@ often written to file descriptor 2 only. This module handles all three. There ar
 
 - `fresh`: SUMO is loaded again for every run; always valid.
 - `reuse`: one simulation keeps running, actors are removed and inserted again. Bit-identical to `fresh`
-  where SUMO draws no random numbers and nothing else has a state to reset.
+  where SUMO draws no random numbers and nothing else has a state to reset (`sbt.sumo.resetting`). A run that changes more
+  than its actors by calls of libsumo is the last one of its simulation.
 - `replicas`: like `reuse`, in a simulation with several copies of the network and one run in each.
 - `snapshot`: the simulation is loaded once, and every run is a child of this process that begins with a saved state;
   or it is loaded for every run, and the state then. Both give the same run (`sbt.sumo.warming`).
@@ -36,6 +37,7 @@ from sbt.sumo.actors import VehicleType
 from sbt.sumo.formatting import format_number
 from sbt.sumo.places import makes_in
 from sbt.sumo.replicas import replicated_net
+from sbt.sumo.resetting import changes_of
 
 __all__ = [
     "INVALID_DOUBLE", "Loadable", "Session", "Setup", "check_options", "is_ballistic", "libsumo", "scratch_folder", "session",
@@ -177,6 +179,7 @@ class Session:
 
     def __init__(self) -> None:
         self._sumo = libsumo()
+        self._changes = changes_of(self._sumo)
         self._setup: Loadable | None = None
         self._routes: set[tuple[str, ...]] = set()
         self._inserted: list[tuple[str, str]] = []
@@ -207,7 +210,10 @@ class Session:
                 if state is not None:
                     self._sumo.simulation.loadState(str(state()))
                 loaded = True
+                self._changes.clear()
                 yield self._sumo
+                if self._changes:
+                    self._setup = None
                 if self._setup is not None:
                     self.remove()
             except BaseException as error:

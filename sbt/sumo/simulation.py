@@ -26,6 +26,7 @@ from sbt.sumo.insertion import insert, type_name, verify
 from sbt.sumo.levels import Levels, levels_of
 from sbt.sumo.models import SUBLANE
 from sbt.sumo.nets import net_file
+from sbt.sumo.resetting import why_fresh
 from sbt.sumo.session import Setup, check_options, session, unwrapped
 from sbt.sumo.sumo_run import SumoRun
 
@@ -52,8 +53,9 @@ class SumoSimulation:
         step_length: SUMO's step (s); positions are integrated by the trapezoidal rule.
         ego: the AV under test.
         lane_change_duration: of continuous lane changes (s).
-        isolations: allowed isolation levels, the fastest last. `reuse` is valid only where SUMO draws no random
-            numbers, `replicas` (several runs in one simulation) only where, moreover, no actor is moved by pose.
+        isolations: allowed isolation levels, the fastest last. `replicas` (several runs in one simulation) is valid only
+            where no actor is moved by pose. A run is `fresh` whatever is allowed where SUMO draws random numbers for it,
+            or the network or an option has a state that goes on from run to run, such as traffic lights (see `why_fresh`).
         isolation: the level of this simulation; None: the fastest.
         options: further SUMO options.
         timeout: wall-clock limit of a run (s); None: none.
@@ -142,7 +144,9 @@ class SumoSimulation:
         scene = self.build_scene(values, seed)
         limit = math.inf if self.timeout is None else self.timeout
         reference = self.isolation == "fresh" != self.isolations[-1]  # asked for although less would do
-        with session().run(self.setup(scene), seed, self.isolation_level, reference=reference) as sumo:
+        setup = self.setup(scene)
+        level = "fresh" if self._why_fresh(setup, scene) else self.isolation_level
+        with session().run(setup, seed, level, reference=reference) as sumo:
             insert(sumo, scene)
             sumo.simulationStep()
             verify(sumo, scene)
@@ -179,7 +183,7 @@ class SumoSimulation:
 
     @property
     def isolation_level(self) -> str:
-        """The isolation level of the runs."""
+        """The isolation level of the runs that need not be `fresh`."""
         return self.isolation or self.isolations[-1]
 
     @property
@@ -203,6 +207,14 @@ class SumoSimulation:
             return tuple(filter(None, [_levels(str(net_file(self.net))).warning]))
         except RunError:
             return ()
+
+    def why_fresh(self, values: Values, seed: int) -> str:
+        """Return why SUMO is loaded for a run although less is allowed; "" where it is not, or nothing else is allowed."""
+        scene = self.build_scene(values, seed)
+        return self._why_fresh(self.setup(scene), scene)
+
+    def _why_fresh(self, setup: Setup, scene: Scene) -> str:
+        return "" if self.isolation_level == "fresh" else why_fresh(setup.net, setup.options, scene.actors)
 
     def build_scene(self, values: Values, seed: int) -> Scene:
         """Return the scene of one concrete scenario, with new controllers."""

@@ -34,7 +34,7 @@ from sbt.workflows.drawn import covariates_first
 from sbt.workflows.fidelity import fidelity_findings
 from sbt.workflows.findings import Finding, row_findings, some_rows
 from sbt.workflows.rehearsal import rehearse
-from sbt.workflows.snapshots import snapshot_findings, which_isolation
+from sbt.workflows.snapshots import fresh_instead, snapshot_findings, which_isolation
 
 __all__ = ["Finding", "check_scenario", "findings_of"]
 
@@ -300,16 +300,17 @@ def _elsewhere(spec: ScenarioSpec, jobs: Sequence[tuple[Values, int]]) -> list[_
 
 
 def _isolations(spec: ScenarioSpec, jobs: Sequence[tuple[Values, int]], points: Sequence[Values]) -> list[Finding]:
-    """Return, for every allowed isolation level but `fresh`, whether it is bit-equal to `fresh`.
+    """Return, for every allowed isolation level but `fresh`, whether it is bit-equal to `fresh`, and where runs are that anyway.
 
     The kept simulation runs the jobs in another order, and twice, so that each follows different ones.
     """
-    levels = spec.resolve().isolations
+    scenario = spec.resolve()
+    levels = scenario.isolations
     if not set(levels) - {"fresh"}:
         return []
     fresh = _runs(replace(spec, isolation="fresh"), jobs)
     order = [*range(0, len(jobs), 2), *range(1, len(jobs), 2), *range(len(jobs))[::-1]]
-    findings = []
+    findings = fresh_instead(scenario.simulate, jobs)
     for level in levels:
         if level != "fresh":
             kept = _runs(replace(spec, isolation=level), [jobs[k] for k in order])

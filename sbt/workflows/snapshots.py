@@ -1,8 +1,9 @@
-"""What `check` proves of runs that begin with warmed traffic."""
+"""What `check` says of the isolation of runs, and proves of those that begin with warmed traffic."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 from sbt.errors import RunError, SbtError
@@ -15,7 +16,7 @@ from sbt.problem.trace import Trace
 from sbt.seeds import run_seed
 from sbt.workflows.findings import Finding
 
-__all__ = ["snapshot_findings", "which_isolation"]
+__all__ = ["fresh_instead", "snapshot_findings", "which_isolation"]
 
 _POINTS = 3
 """Points that are compared."""
@@ -43,6 +44,20 @@ def which_isolation(spec: ScenarioSpec) -> list[Finding]:
     else:
         said = f"fresh: every run simulates its traffic from the beginning: {isolation.why or 'so did the first run'}"
     return [Finding("for information: isolation", ok=True, detail=said, numbers=numbers)]
+
+
+def fresh_instead(simulate: object, jobs: Sequence[tuple[Values, int]]) -> list[Finding]:
+    """Return why SUMO is loaded for runs of a scene that allows less; nothing where it is not."""
+    asked = getattr(simulate, "why_fresh", lambda *_: "")
+    found: list[str] = []
+    for values, seed in jobs:
+        with suppress(RunError):  # a scene that cannot be built is an invalid run
+            found += filter(None, [asked(values, seed)])
+    if not found:
+        return []
+    runs = "every run" if len(found) == len(jobs) else f"{len(found)} of {len(jobs)} runs"
+    said = f"fresh: SUMO is loaded for {runs}: {'; '.join(dict.fromkeys(found))}"
+    return [Finding("for information: isolation", ok=True, detail=said, numbers={"fresh": len(found) / len(jobs)})]
 
 
 def snapshot_findings(spec: ScenarioSpec, points: Sequence[Values], seed: int, digest: Digest) -> Iterator[Finding]:
