@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 from test_evidence import SOUTH_NORTH, WEST_EAST, net
 
+from sbt.config.scenario_file import from_file
 from sbt.metrics.fcd import catalogue
 from sbt.metrics.geometry import contact_index
+from sbt.metrics.traffic import TTC_PATH_MIN
 from sbt.sumo.actors import KEEP, Action, Actor, Scene, State, VehicleType
 from sbt.sumo.simulation import SumoSimulation
 
@@ -178,3 +180,76 @@ def test_a_run_ends_where_metrics_see_a_bent_body_touch(tmp_path: Path) -> None:
     found = contact_index(trace.actor("ego"), trace.actor("co"))
     assert trace.ended == "collision"
     assert found == len(trace.time) - 1
+
+
+def two_in_a_bend(path: Path, duration: float, **settings: Any) -> SumoSimulation:
+    """Ego and a bus beside it in a bend, in lanes of their own."""
+
+    def scene(values: Any, ego: Any, rng: Any) -> Scene:
+        return Scene((
+            Actor("ego", ("bend",), 1, 58.0, 8.0, None, CAR), Actor("co", ("bend",), 0, 62.0, 8.0, Looking(set()), BUS),
+            Actor("far", ("bend",), 0, 130.0 + values["p"], 8.0, None, CAR),
+        ))  # fmt: skip
+
+    path.write_text(net({"bend": BEND}, lanes=2))
+    return SumoSimulation(str(path), scene, duration, 0.1, isolations=("fresh", "reuse", "replicas"), **settings)
+
+
+def test_at_the_end_of_a_run_actors_go_on_along_their_lanes(tmp_path: Path) -> None:
+    """Straight on ego hits the bus, which it never meets. Who drives straight on anyhow needs no way."""
+    path = tmp_path / "a.net.xml"
+    short, long = (two_in_a_bend(path, duration, isolation="fresh")({"p": 0.0}, 1) for duration in (2.0, 5.5))
+    n = len(short.time)
+    assert set(short.ways) == {"ego", "co"}
+    assert (TTC_PATH_MIN(short), TTC_PATH_MIN(replace(short, ways={}))) == (5.0, pytest.approx(0.91, abs=0.01))
+    for name in short.ways:
+        one, other = short.actor(name), long.actor(name)
+        for now, later in zip((one, *one.parts), (other, *other.parts), strict=True):
+            assert now.way is not None
+            x, y, heading = now.way.T
+            apart = np.hypot(later.x[n:, None] - x, later.y[n:, None] - y)
+            near = apart.argmin(axis=1)
+            assert apart.min(axis=1).max() < 0.6, "its points are 1 m apart"
+            across = (later.y[n:] - y[near]) * np.cos(heading[near]) - (later.x[n:] - x[near]) * np.sin(heading[near])
+            assert np.abs(across).max() < 0.15
+
+
+def test_the_ways_of_a_scene_are_those_of_the_same_files(tmp_path: Path) -> None:
+    scene = two_in_a_bend(tmp_path / "a.net.xml", 2.0, isolation="fresh")({"p": 0.0}, 1)
+    kind = 'minGap="0" speedFactor="1" speedDev="0" sigma="0" accel="10" decel="10" emergencyDecel="10"'
+    cars = "".join(
+        f'<vehicle id="{name}" type="{kind}" depart="0" departLane="{lane}" departPos="{at}" departSpeed="8" '
+        f'insertionChecks="none"><route edges="bend"/></vehicle>'
+        for name, kind, lane, at in (("ego", "car", 1, 58), ("co", "bus", 0, 62), ("far", "car", 0, 130))
+    )
+    (tmp_path / "a.rou.xml").write_text(
+        f'<routes><vType id="car" length="5" width="1.8" maxSpeed="10" {kind}/>'
+        f'<vType id="bus" length="14" width="2.5" maxSpeed="${{v}}" {kind}/>{cars}</routes>'
+    )
+    (tmp_path / "a.yaml").write_text(
+        "sumo: {net: a.net.xml, routes: [a.rou.xml], options: {step-method.ballistic: true}}\n"
+        "inputs: {v: {min: 8, max: 9}}\nego: ego\nduration: 2\nstep_length: 0.1\nothers: {within: 300}\n"
+        "metrics: [ttc_path_min]\nrequirement: {metric: ttc_path_min, critical: [-.inf, 1.0]}\n"
+    )
+    simulate = from_file(str(tmp_path / "a.yaml"), tmp_path).simulate
+    assert simulate is not None
+    files = simulate({"v": 8.0}, 1)
+    assert set(scene.ways) == {"ego", "co"}
+    assert files.actor("co").x == pytest.approx(scene.actor("co").x, abs=1e-3)
+    for name in scene.ways:
+        a, b = scene.actor(name), files.actor(name)
+        for one, other in zip((a, *a.parts), (b, *b.parts), strict=True):
+            assert one.way is not None
+            assert other.way is not None
+            assert len(one.way) > 30
+            assert one.way == pytest.approx(other.way[: len(one.way)], abs=1e-3)
+
+
+def test_ways_are_the_same_in_every_isolation(tmp_path: Path) -> None:
+    path = tmp_path / "a.net.xml"
+    work = [({"p": p}, 1) for p in (0.0, 3.0, 6.0)]
+    fresh = [two_in_a_bend(path, 2.0, isolation="fresh")(*one) for one in work]
+    for isolation in ("reuse", "replicas"):
+        for a, b in zip(fresh, two_in_a_bend(path, 2.0, isolation=isolation).simulate_many(work), strict=True):
+            assert a.ways
+            assert a.identical(b)

@@ -42,7 +42,8 @@ class Course:
     @cached_property
     def heading(self) -> Vector:
         """Along the path (rad), without jumps."""
-        return np.unwrap(self._joined(2, self.actor.heading))
+        heading = self._joined(2, self.actor.heading)
+        return heading if np.ptp(heading) < np.pi else np.unwrap(heading)
 
     @cached_property
     def way(self) -> Vector:

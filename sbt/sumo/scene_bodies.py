@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sbt.problem.trace import ActorTrace
+from sbt.problem.trace import ActorTrace, States
 from sbt.sumo.actors import Actor, State
 from sbt.sumo.lanes_behind import Lanes, trailing_body
 from sbt.sumo.overlaps import may_touch
@@ -60,13 +60,21 @@ class SceneBodies:
         poses = body.poses(self._steps[name][first : first + len(track.x)])
         return replace(track, parts=part_traces(poses, track.speed, track.acceleration, body.part_length, track.width))
 
-    def parts(self, states: Mapping[str, np.ndarray]) -> dict[str, tuple[ActorTrace, ...]]:
-        """Return the parts of all that bend over all rows, NaN where their (t, 5) states, given by name, are."""
+    def poses(self, name: str) -> States:
+        """Return the (n, 3) poses of the parts of one that bends, now."""
+        found: States = self._bodies[name].poses(self._steps[name][-1:])[0]
+        return found
+
+    def parts(
+        self, states: Mapping[str, np.ndarray], ways: Mapping[str, tuple[States, ...]]
+    ) -> dict[str, tuple[ActorTrace, ...]]:
+        """Return the parts of all that bend over all rows, NaN where their (t, 5) states, given by name, are, with their ways."""
         found = {}
         for name, body in self._bodies.items():
             poses, speed, acceleration = body.poses(self._steps[name]), states[name][:, 3], states[name][:, 4]
             poses[np.isnan(speed)] = np.nan
-            found[name] = part_traces(poses, speed, acceleration, body.part_length, self._widths[name])
+            size = body.part_length, self._widths[name]
+            found[name] = part_traces(poses, speed, acceleration, *size, ways.get(name, ()))
         return found
 
 

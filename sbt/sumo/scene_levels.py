@@ -47,6 +47,11 @@ class SceneLevels:
         """Contacts of the ego in the plane that are none, as roads of a network without heights are taken for bridges."""
         return self._levels[0].notes
 
+    @property
+    def gone(self) -> frozenset[int]:
+        """Who has left the level of the ego since the step before."""
+        return self.hidden[-1] - self.hidden[-2] if len(self.hidden) > 1 else frozenset()
+
     def look(self, t: float, states: Mapping[str, State]) -> None:
         """Look where everybody is at t (s)."""
         own, actors = self._levels[0], self._actors

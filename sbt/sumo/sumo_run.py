@@ -23,6 +23,7 @@ from sbt.sumo.overlaps import instant
 from sbt.sumo.reading import ROW, Onlooker, observer, table
 from sbt.sumo.scene_bodies import SceneBodies, may_meet
 from sbt.sumo.scene_levels import SceneLevels
+from sbt.sumo.scene_ways import SceneWays
 from sbt.sumo.session import is_ballistic, unwrapped
 
 __all__ = ["SumoRun"]
@@ -71,6 +72,7 @@ class SumoRun:
         states = [State(a.name, float(a.type.length), float(a.type.width), dt) for a in scene.actors]
         for actor, state in zip(scene.actors, states, strict=True):
             state.steered = None if actor.pose is None else float(actor.speed)
+        self._ways = SceneWays(sumo, scene.actors, states, prefix, self._bodies)
         until, probes = scene.until, tuple(scene.signals.values())
         control = _control(sumo, scene.actors, states, dt, prefix, self._levels)
         touching = _contact_test(states, rows, dt, self._bodies, self._levels)
@@ -120,6 +122,9 @@ class SumoRun:
             self._bodies.move(states)
         if self._levels is not None:
             self._levels.look(t, states)
+            if gone := self._levels.gone:
+                poses = np.array([(s.x, s.y, s.heading) for s in (states[a.name] for a in self._scene.actors)])
+                self._ways.keep(gone, poses, np.full(len(poses), MAX_SPEED))
 
     def _check_start(self, states: list[State]) -> None:
         """Check that the ego starts clear of all on its level, and of all obstacles."""
@@ -156,6 +161,8 @@ class SumoRun:
         states = table(self._rows, 0, self.recorded(), len(actors)).copy() if seen is None else seen.table()
         sizes = [(a.type.length, a.type.width) for a in actors]
         names = [a.name for a in actors]
+        there = range(len(actors)) if self._levels is None else self._levels.on_its(0, range(len(actors)))
+        self._ways.keep(there, states[-1, :, :3], states[:, :, 3].max(axis=0))
         if scene.obstacles:
             standing = np.array([(*o.pose, 0.0, 0.0) for o in scene.obstacles])
             states = np.concatenate([states, np.broadcast_to(standing, (len(states), *standing.shape))], axis=1)
@@ -165,6 +172,7 @@ class SumoRun:
         if self._levels is not None:
             for k, hidden in enumerate(self._levels.hidden):
                 states[k, list(hidden)] = np.nan
+        of_each = {a.name: states[:, k] for k, a in enumerate(actors)}
         x, y, heading, speed, acceleration = np.moveaxis(states, 2, 0)
         return Trace(
             np.arange(len(states), dtype=np.float64) * self._dt,
@@ -179,7 +187,8 @@ class SumoRun:
             self._ended,
             tuple(self._collisions),
             {name: np.array([row[k] for row in self._signals]) for k, name in enumerate(scene.signals)},
-            parts={} if self._bodies is None else self._bodies.parts({a.name: states[:, k] for k, a in enumerate(actors)}),
+            ways=self._ways.whole,
+            parts={} if self._bodies is None else self._bodies.parts(of_each, self._ways.parts),
             unconfirmed=(*self._unconfirmed, *(() if self._levels is None else self._levels.notes)),
             ballistic=is_ballistic(self._sumo),
             flat=tuple(o.name for o in scene.obstacles if not o.solid),

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -33,7 +32,7 @@ from sbt.sumo.session import INVALID_DOUBLE, is_ballistic
 from sbt.sumo.tables import table_of
 from sbt.sumo.teleports import Teleports
 from sbt.sumo.trailing import LONGEST_RIGID, TrailingBody, part_traces
-from sbt.sumo.ways import LEFT_THE_ROAD, line_ahead, line_behind, rectangle_ways
+from sbt.sumo.ways import LEFT_THE_ROAD, ways_ahead
 
 __all__ = ["Surroundings"]
 
@@ -202,11 +201,9 @@ class Surroundings:
         if now[0] != INVALID_DOUBLE and moved > float(farthest(elapsed)):
             self._note_jump(name, moved, crossed=self._junctions.explain(name, moved, state.speed * elapsed))
             return
-        ahead, poses = line_ahead(self._sumo, name), self._poses(name, len(self._rows) - 1)
-        size, behind = state.length / len(poses), line_behind(poses, state.length)
-        if ahead is not None and (ways := rectangle_ways(behind, ahead, state.length)):
-            parts = [k * size for k in range(len(poses))] if name in self._parts[-1] else []
-            self._ways[name] = (*ways, *rectangle_ways(behind, ahead, size, parts))
+        poses, bends = self._poses(name, len(self._rows) - 1), name in self._parts[-1]
+        if ways := ways_ahead(self._sumo, name, poses, state.length, bends=bends):
+            self._ways[name] = ways
 
     def _around(self, near: Mapping[str, Any]) -> list[str]:
         """Return who is near, whose rear may be, and who is named; whom a loop has removed is forgotten."""
@@ -389,6 +386,5 @@ class Surroundings:
     def _parts_of(self, name: str, table: np.ndarray) -> tuple[ActorTrace, ...]:
         """Return the parts of a long vehicle over all instants, NaN where it is not there."""
         poses = self._bodies[name].poses_among([parts.get(name) for parts in self._parts])
-        made = part_traces(poses, table[:, 3], table[:, 4], self._bodies[name].part_length, self.states[name].width)
-        ways = self._ways.get(name, ())[1:]
-        return tuple(replace(part, way=way) for part, way in zip(made, ways, strict=True)) if ways else made
+        size, ways = (self._bodies[name].part_length, self.states[name].width), self._ways.get(name, ())[1:]
+        return part_traces(poses, table[:, 3], table[:, 4], *size, ways)

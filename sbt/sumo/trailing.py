@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 
 from sbt.metrics.geometry import LANE_CHANGE
-from sbt.problem.trace import ActorTrace
+from sbt.problem.trace import ActorTrace, States
 
 __all__ = ["LONGEST_RIGID", "TrailingBody", "part_traces"]
 
@@ -204,10 +204,10 @@ class _Path:
 
 
 def part_traces(
-    poses: np.ndarray, speed: np.ndarray, acceleration: np.ndarray, length: float, width: float
+    poses: np.ndarray, speed: np.ndarray, acceleration: np.ndarray, length: float, width: float, ways: Sequence[States] = ()
 ) -> tuple[ActorTrace, ...]:
-    """Return the parts of a long vehicle from their (t, parts, 3) poses."""
+    """Return the parts of a long vehicle from their (t, parts, 3) poses, with their ways where these are known."""
     return tuple(
-        ActorTrace(poses[:, j, 0], poses[:, j, 1], poses[:, j, 2], speed, acceleration, length, width)
-        for j in range(poses.shape[1])
+        ActorTrace(x, y, heading, speed, acceleration, length, width, way=ways[j] if ways else None)
+        for j, (x, y, heading) in enumerate(poses.transpose(1, 2, 0))
     )

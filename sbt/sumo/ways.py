@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from sbt.problem.trace import States
 
-__all__ = ["LEFT_THE_ROAD", "line_ahead", "line_behind", "rectangle_ways"]
+__all__ = ["LEFT_THE_ROAD", "goes_straight", "ways_ahead"]
 
 LEFT_THE_ROAD: States = np.full((1, 3), np.nan)
 """The way of a vehicle that has arrived: there is none."""
@@ -17,39 +19,95 @@ _LENGTH = 200.0
 """Length of a way (m): 5 s at 40 m/s."""
 _STEP = 1.0
 """Distance of its points (m)."""
+_STRAIGHT = 0.02
+"""How far beside a straight line lanes may be that are taken for straight ones (m): coordinates are rounded to 1 cm."""
 
 
-def line_ahead(sumo: Any, name: str) -> States | None:
-    """Return the (k, 2) points of the lanes ahead of the front of a vehicle, at its lateral place; None where it has no lane.
+def ways_ahead(
+    sumo: Any, name: str, poses: States, length: float, *, bends: bool, reach: float = _LENGTH
+) -> tuple[States, ...]:
+    """Return the ways (k, 3) of a vehicle's rectangle and, if it bends, of its parts; none where it has no lane ahead.
 
     Args:
         sumo: libsumo or traci.
         name: of a vehicle on the road.
+        poses: (n, 3) of its parts, the front one first.
+        length: of the vehicle (m).
+        bends: whether its parts are recorded.
+        reach: how far the ways must lead (m), at most 200.
     """
+    reach = min(reach, _LENGTH)
+    if (ahead := _line_ahead(sumo, name, reach)) is None:
+        return ()
+    behind, size = _line_behind(poses, length), length / len(poses)
+    ways = _rectangle_ways(behind, ahead, length, reach)
+    if ways and bends:
+        ways += _rectangle_ways(behind, ahead, size, reach, [k * size for k in range(len(poses))])
+    return tuple(ways)
+
+
+def goes_straight(sumo: Any, name: str, heading: float, reach: float) -> bool:
+    """Return whether the lanes ahead of a vehicle lead straight on from where it is, so that its way says nothing new.
+
+    Args:
+        sumo: libsumo or traci.
+        name: of a vehicle on the road.
+        heading: of the vehicle (rad).
+        reach: how far ahead is looked (m).
+    """
+    (x, y), cos, sin = sumo.vehicle.getPosition(name)[:2], math.cos(heading), math.sin(heading)
+    for u, v in _middle_ahead(sumo, name):
+        ahead, left = (u - x) * cos + (v - y) * sin, (v - y) * cos - (u - x) * sin
+        if ahead < -_STRAIGHT or abs(left) > _STRAIGHT:
+            return False
+        if ahead > min(reach, _LENGTH):
+            break
+    return True
+
+
+def _middle_ahead(sumo: Any, name: str) -> Iterator[tuple[float, float]]:
+    """Yield the points ahead on the lane of a vehicle, and those that its route leads to; none where it has no lane."""
+    lane, here = sumo.lane, sumo.vehicle.getLaneID(name)
+    if here:
+        shape = lane.getShape(here)
+        along = _line(shape)[1]
+        yield from (point[:2] for point in shape[int(along.searchsorted(_at(sumo, name, here, along), side="right")) :])
+        for following, inside in _links_ahead(sumo, name, here):
+            for part in (*_inside(lane, inside), following):
+                yield from (point[:2] for point in lane.getShape(part))
+
+
+def _line_ahead(sumo: Any, name: str, reach: float) -> States | None:
+    """Return the (k, 2) points of the lanes ahead of the front of a vehicle, at its lateral place; None where it has no lane."""
     vehicle, lane = sumo.vehicle, sumo.lane
     here, front = vehicle.getLaneID(name), np.array(vehicle.getPosition(name)[:2])
     if not here:
         return None
-    shape = _points(lane.getShape(here))
-    at = vehicle.getLanePosition(name) * float(_along(shape)[-1]) / max(lane.getLength(here), 1e-9)
-    if (own := _beside_opposite(sumo, name, here, shape, at)) is not None:
-        here, shape = own, _points(lane.getShape(own))
+    shape, along = _line(lane.getShape(here))
+    at = _at(sumo, name, here, along)
+    if (own := _beside_opposite(sumo, name, here, shape, along, at)) is not None:
+        here, (shape, along) = own, _line(lane.getShape(own))
         at = _nearest(shape, front)
-    foot, direction = _place(shape, at)
-    along = _along(shape)
+    foot, direction = _place(shape, along, at)
     ahead = [foot[None], shape[along > at]]
     length = along[-1] - at
     for following, inside in _links_ahead(sumo, name, here):
-        if length > _LENGTH:
+        if length > reach:
             break
         for part in (*_inside(lane, inside), following):
-            ahead.append(_points(lane.getShape(part)))
-            length += float(_along(ahead[-1])[-1])
+            points, distances = _line(lane.getShape(part))
+            ahead.append(points)
+            length += float(distances[-1])
     beside = front - foot
     return _beside(np.concatenate(ahead), float(direction[0] * beside[1] - direction[1] * beside[0]))[1:]
 
 
-def _beside_opposite(sumo: Any, name: str, here: str, shape: States, at: float) -> str | None:
+def _at(sumo: Any, name: str, here: str, along: States) -> float:
+    """Return how far along the points of its lane a vehicle is (m); SUMO's own length of a lane may be another one."""
+    return float(sumo.vehicle.getLanePosition(name) * float(along[-1]) / max(sumo.lane.getLength(here), 1e-9))
+
+
+def _beside_opposite(sumo: Any, name: str, here: str, shape: States, along: States, at: float) -> str | None:
     """Return the lane of its route beside which a vehicle overtakes, if it is on one of opposite traffic.
 
     Such a lane is of another edge than the route has here, and its direction `at` (m) is not that of the vehicle.
@@ -58,7 +116,7 @@ def _beside_opposite(sumo: Any, name: str, here: str, shape: States, at: float) 
     route, k, angle = vehicle.getRoute(name), vehicle.getRouteIndex(name), np.radians(vehicle.getAngle(name))
     if here.startswith(":") or not 0 <= k < len(route) or route[k] == edge:
         return None
-    if float(_place(shape, at)[1] @ np.array([np.sin(angle), np.cos(angle)])) >= 0.0:
+    if float(_place(shape, along, at)[1] @ np.array([np.sin(angle), np.cos(angle)])) >= 0.0:
         return None
     return f"{route[k]}_{sumo.edge.getLaneNumber(route[k]) - 1}"
 
@@ -101,19 +159,22 @@ def _links_to(lane: Any, here: str, edge: str, kind: str) -> list[Any]:
     return [link for link in links if not (allowed := lane.getAllowed(link[0])) or kind in allowed]
 
 
-def line_behind(poses: States, length: float) -> States:
+def _line_behind(poses: States, length: float) -> States:
     """Return the points of a vehicle from its rear to its front, of the (n, 3) poses of its parts, the front one first."""
     reach = 0.5 * length / len(poses) * np.stack([np.cos(poses[::-1, 2]), np.sin(poses[::-1, 2])], axis=1)
     return np.vstack([poses[::-1, :2] - reach, poses[:1, :2] + reach[-1]])
 
 
-def rectangle_ways(behind: States, ahead: States, length: float, offsets: Sequence[float] = (0.0,)) -> list[States]:
+def _rectangle_ways(
+    behind: States, ahead: States, length: float, reach: float, offsets: Sequence[float] = (0.0,)
+) -> list[States]:
     """Return the (k, 3) centre and heading of rectangles whose front and rear go along a line, as SUMO places them.
 
     Args:
         behind: (n, 2) points that the body stands on now, from its rear to its front.
         ahead: (m, 2) points in front of it.
         length: of the rectangles (m).
+        reach: how far they go (m).
         offsets: from the front of the body to that of each rectangle (m).
 
     Returns:
@@ -121,15 +182,16 @@ def rectangle_ways(behind: States, ahead: States, length: float, offsets: Sequen
     """
     line = np.concatenate([behind, ahead])
     along = _along(line)
-    start = float(_along(behind)[-1])
-    ahead_of_body = np.arange(start + _STEP, min(along[-1], start + _LENGTH), _STEP)
+    start = float(along[len(behind) - 1])
+    ahead_of_body = np.arange(start + _STEP, min(along[-1], start + reach), _STEP)
     if not ahead_of_body.size:
         return []
     front = ahead_of_body - np.array(offsets)[:, None]  # (rectangles, k)
-    ends = [np.stack([np.interp(s, along, line[:, k]) for k in (0, 1)], axis=2) for s in (front, front - length)]
-    chord = ends[0] - ends[1]
-    heading = np.unwrap(np.arctan2(chord[:, :, 1], chord[:, :, 0]), axis=1)
-    return list(np.concatenate([0.5 * (ends[0] + ends[1]), heading[:, :, None]], axis=2))
+    (ax, ay), (bx, by) = ([np.interp(s, along, line[:, k]) for k in (0, 1)] for s in (front, front - length))
+    ways = np.empty((*front.shape, 3))
+    ways[:, :, 0], ways[:, :, 1], heading = 0.5 * (ax + bx), 0.5 * (ay + by), np.arctan2(ay - by, ax - bx)
+    ways[:, :, 2] = np.unwrap(heading, axis=1) if np.ptp(heading) >= math.pi else heading
+    return list(ways)
 
 
 def _inside(lane: Any, first: str) -> list[str]:
@@ -142,21 +204,26 @@ def _inside(lane: Any, first: str) -> list[str]:
     return found
 
 
-def _points(shape: Any) -> States:
-    return np.array([point[:2] for point in shape], dtype=np.float64).reshape(-1, 2)
+@lru_cache(maxsize=1024)
+def _line(shape: tuple[tuple[float, ...], ...]) -> tuple[States, States]:
+    """Return the (n, 2) points of a lane, and their distances along it (m)."""
+    points = np.array([point[:2] for point in shape], dtype=np.float64).reshape(-1, 2)
+    return points, _along(points)
 
 
 def _along(points: States) -> States:
-    return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+    along = np.zeros(max(len(points), 1))
+    step = points[1:] - points[:-1]
+    np.cumsum(np.hypot(step[:, 0], step[:, 1]), out=along[1:])
+    return along
 
 
-def _place(points: States, at: float) -> tuple[States, States]:
+def _place(points: States, along: States, at: float) -> tuple[States, States]:
     """Return the point at a distance along a polyline (m), and the direction of its segment there, (2,) each."""
-    along = _along(points)
-    k = int(np.clip(np.searchsorted(along, at, side="right") - 1, 0, len(points) - 2))
+    k = min(max(int(along.searchsorted(at, side="right")) - 1, 0), len(points) - 2)
     step = points[k + 1] - points[k]
-    size = max(float(np.hypot(*step)), 1e-9)
-    return points[k] + step / size * np.clip(at - along[k], 0.0, size), step / size
+    direction = step / (size := max(float(np.hypot(step[0], step[1])), 1e-9))
+    return points[k] + direction * min(max(float(at - along[k]), 0.0), size), direction
 
 
 def _nearest(points: States, to: States) -> float:
@@ -172,8 +239,12 @@ def _nearest(points: States, to: States) -> float:
 def _beside(points: States, left: float) -> States:
     """Return a polyline moved to the left (m), each point once: a lane begins where the one before it ends."""
     if len(points) > 1:
-        points = points[np.concatenate([[True], np.hypot(*np.diff(points, axis=0).T) > 1e-3])]
+        apart = points[1:] - points[:-1]
+        points = np.concatenate([points[:1], points[1:][np.hypot(apart[:, 0], apart[:, 1]) > 1e-3]])
     if left == 0.0 or len(points) < 2:
         return points
-    step = np.gradient(points, axis=0)
-    return points + left * np.stack([-step[:, 1], step[:, 0]], axis=1) / np.maximum(np.hypot(*step.T), 1e-9)[:, None]
+    step = np.empty_like(points)
+    step[0], step[1:-1], step[-1] = points[1] - points[0], (points[2:] - points[:-2]) / 2.0, points[-1] - points[-2]
+    across = np.empty_like(points)
+    across[:, 0], across[:, 1] = -step[:, 1], step[:, 0]
+    return points + left * across / np.maximum(np.hypot(step[:, 0], step[:, 1]), 1e-9)[:, None]
