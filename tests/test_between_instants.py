@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from sbt.metrics.around import smallest_distance
 from sbt.metrics.planar import distance_min, post_encroachment_time, severity, time_behind
 from sbt.metrics.rss import rss_lateral_min
+from sbt.metrics.shifts import evenly
 from sbt.problem.trace import Trace
 
 Way = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
@@ -75,6 +76,19 @@ def test_the_pet_of_a_recording_with_gaps_is_in_seconds(known):
     assert np.ptp(np.diff(gaps.time)) > 0.05
     for found in (post_encroachment_time(gaps), time_behind(gaps, other=None)):
         assert found == pytest.approx((50.0 - 0.9) / 20.0 - (130.9 + 5.0 - 100.0) / 20.0, abs=1e-3)
+
+
+def test_two_instants_close_together_do_not_make_a_recording_long():
+    """A millisecond between two rows divided all steps by 64, which took 12 GB."""
+    way = straight(0.0, 0.0, 0.0, 10.0)
+    ways = {"ego": way, "co": lambda t: way(t - 2.0)}
+    time = np.sort(np.append(np.arange(300) * 0.04, 4.0001))
+    x, y, heading = (np.column_stack(states) for states in zip(*(each(time) for each in ways.values()), strict=True))
+    trace = Trace(time, tuple(ways), x, y, heading, np.full_like(x, 10.0), np.zeros_like(x), np.full(2, 5.0), np.full(2, 1.8))
+    (first, _), step = evenly(trace, [trace.actor("ego"), trace.actor("co")])
+    assert len(first.x) <= 4 * len(time)
+    assert step == pytest.approx(0.04, rel=0.01)
+    assert post_encroachment_time(trace) == pytest.approx(1.5, abs=2e-3)
 
 
 @pytest.mark.parametrize("step", [0.1, 0.2, 0.5, 1.0])

@@ -10,9 +10,12 @@ from sbt.metrics.discs import is_person
 from sbt.problem.arrays import Vector
 from sbt.problem.trace import ActorTrace
 
-__all__ = ["at_times", "finer", "on_arcs", "parts_of_passing", "parts_of_turns"]
+__all__ = [
+    "SWING", "after_shares", "at_times", "finer", "is_coarse", "on_arcs", "parts_of_passing", "parts_of_swing", "parts_of_turns",
+    "swings",
+]  # fmt: skip
 
-_SWING = 0.3
+SWING = 0.3
 """How far a corner may move in a step because its rectangle turns, before the step is divided (m)."""
 _SHORT, _PARTS = 0.1, 16
 """Steps no longer than the first (s) are not divided; longer ones into so many parts, at most."""
@@ -48,16 +51,26 @@ def on_arcs(
     return at_x, at_y, old + s * turn[:, None]
 
 
+def is_coarse(step: float) -> bool:
+    """Return whether what turns in a step (s) is looked at on its arc."""
+    return step > _SHORT + 1e-9
+
+
 def parts_of_turns(actors: Sequence[ActorTrace], step: float) -> int:
     """Return into how many parts steps (s) are divided so that no corner of the actors swings far in one; a power of two.
 
     Persons are small, and SUMO turns them at once.
     """
-    if step <= _SHORT + 1e-9:
+    if not is_coarse(step):
         return 1
-    swing = max((_swing(part) for actor in actors for part in actor.parts or (actor,) if not is_person(part)), default=0.0)
+    bodies = (part for actor in actors for part in actor.parts or (actor,) if not is_person(part))
+    return parts_of_swing(max(map(_swing, bodies), default=0.0))
+
+
+def parts_of_swing(swing: float) -> int:
+    """Return into how many parts a step is divided so that a corner that moves so far (m) moves little in each."""
     parts = 1
-    while parts * _SWING < swing and parts < _PARTS:
+    while parts * SWING < swing and parts < _PARTS:
         parts *= 2
     return parts
 
@@ -73,8 +86,13 @@ def parts_of_passing(a: ActorTrace, b: ActorTrace) -> int:
 
 def _swing(actor: ActorTrace) -> float:
     """Return by how much (m) a corner moves, at most, because its rectangle turns within a step."""
-    half = 0.5 * np.diff(actor.heading)
-    return float(np.hypot(actor.length, actor.width) * np.fmax.reduce(np.abs(np.sin(half)), initial=0.0))
+    return float(np.fmax.reduce(swings(actor), initial=0.0))
+
+
+def swings(actor: ActorTrace) -> Vector:
+    """Return (t - 1,) by how much (m) a corner moves because the rectangle of an actor turns, in each step."""
+    half = 0.5 * (actor.heading[1:] - actor.heading[:-1])
+    return np.asarray(np.hypot(actor.length, actor.width) * np.abs(np.sin(half)))
 
 
 def finer(actor: ActorTrace, parts: int) -> ActorTrace:
@@ -82,16 +100,16 @@ def finer(actor: ActorTrace, parts: int) -> ActorTrace:
     if parts == 1:
         return actor
     at = np.arange((len(actor.x) - 1) * parts + 1)
-    return _between(actor, at // parts, at % parts / parts)
+    return after_shares(actor, at // parts, at % parts / parts)
 
 
 def at_times(actor: ActorTrace, time: Vector, at: Vector) -> ActorTrace:
     """Return an actor, known at times (t,), at others (n,) within them, on arcs; (s)."""
     step = np.clip(np.searchsorted(time, at, side="right") - 1, 0, len(time) - 2)
-    return _between(actor, step, (at - time[step]) / (time[step + 1] - time[step]))
+    return after_shares(actor, step, (at - time[step]) / (time[step + 1] - time[step]))
 
 
-def _between(actor: ActorTrace, step: np.ndarray, share: Vector) -> ActorTrace:
+def after_shares(actor: ActorTrace, step: np.ndarray, share: Vector) -> ActorTrace:
     """Return an actor after shares (n,) of steps (n,); between two instants it is there where it is at both."""
     here, end = step + (share >= 1.0), np.minimum(step + 1, len(actor.x) - 1)
     within = (share > 0.0) & (share < 1.0)
@@ -102,5 +120,5 @@ def _between(actor: ActorTrace, step: np.ndarray, share: Vector) -> ActorTrace:
     speed, acceleration = (
         np.where(within, v[step] + share * (v[end] - v[step]), v[here]) for v in (actor.speed, actor.acceleration)
     )  # fmt: skip
-    bodies = tuple(_between(part, step, share) for part in actor.parts)
+    bodies = tuple(after_shares(part, step, share) for part in actor.parts)
     return ActorTrace(x, y, heading, speed, acceleration, actor.length, actor.width, bodies)
