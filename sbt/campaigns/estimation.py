@@ -85,6 +85,7 @@ class EstimationConclusion:
         requirements: of a combination, the probability of each requirement, from the same draws.
         warmed_traffic: what the result is conditional on, where runs began with warmed traffic.
         combinations: of whole numbers and choices, where all of them were to be run and their probabilities summed.
+        drawn_combinations: of these, those that random draws stand for, since the simulator is noisy; None: each was to be run.
         fidelity: what coarse runs did for it, where there are some.
         pairs: of inputs and seed, from which counted runs were drawn by what the seed draws; None: seeds were not looked at.
         explained: what inputs and drawn traffic explain of the metric; None: it is not known.
@@ -111,6 +112,7 @@ class EstimationConclusion:
     requirements: tuple[RequirementEstimate, ...] | None = optional()
     warmed_traffic: Spread | None = optional()
     combinations: int | None = optional()
+    drawn_combinations: int | None = optional()
     fidelity: LevelsTold | None = optional()
     pairs: int | None = optional()
     explained: ExplainedVariance | None = optional()
@@ -361,6 +363,7 @@ def conclude_sum(log: Log, settings: Settings) -> Concluded:
         value, limits, cov=found.std_error / value if value > 0 else None, hits=found.hits, failed_as_safe=value,
         failed_as_critical=_clipped(found.worst.value), effective_sample_size=float(len(found.share.weight)),
         undetected_mass_bound=found.missing, counted=len(found.share.weight), combinations=found.combinations, exact_bound=bound,
+        drawn_combinations=found.drawn or None,
     ), limits  # fmt: skip
 
 

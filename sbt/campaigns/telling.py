@@ -242,8 +242,8 @@ def tell_estimation(found: EstimationConclusion, facts: Facts) -> list[str]:
     rests = "" if n == 0 else f", from {plural(n, 'run')}"
     every = found.combinations is not None and found.undetected_mass_bound == 0.0
     critical = f"{found.hits:,} of them {'was' if found.hits == 1 else 'were'} critical"
-    if every and found.counted:
-        rests += f", of which {found.counted:,} count, all {found.combinations:,} combinations of the inputs, and {critical}"
+    if found.counted and (every or found.drawn_combinations):
+        rests += f", of which {found.counted:,} count, {_combinations(found)}, and {critical}"
     elif found.counted:
         rests += f", of which {plural(found.counted, 'random draw')} count{'s' if found.counted == 1 else ''} and {critical}"
     subject = f"a critical run{_of(facts)} ({_condition(facts)}) under the inputs' distribution"
@@ -273,7 +273,16 @@ def tell_estimation(found: EstimationConclusion, facts: Facts) -> list[str]:
         if found.probability >= 1.0 and safe_runs(facts):
             said = f"The probability of {subject} is at least {number(found.low, 3)} ({confidence} interval to 1)"
         silent = _not_told(found, facts, every)
-    return [f"{verdict}{said}{rests}.", f"{silent}.", f"Next: {_every_combination(facts)}{_after_estimation(found, facts)}."]
+    every_one = "" if found.drawn_combinations else _every_combination(facts)
+    return [f"{verdict}{said}{rests}.", f"{silent}.", f"Next: {every_one}{_after_estimation(found, facts)}."]
+
+
+def _combinations(found: EstimationConclusion) -> str:
+    """Return how many combinations of the inputs were run, each for itself or by random draws."""
+    n, drawn = found.combinations or 0, found.drawn_combinations or 0
+    if not drawn:
+        return f"all {n:,} combinations of the inputs"
+    return f"{n - drawn:,} of all {n:,} combinations of the inputs and, as the simulator is noisy, random draws for the others"
 
 
 def _not_told(found: EstimationConclusion, facts: Facts, every: bool) -> str:
@@ -295,6 +304,9 @@ def _not_told(found: EstimationConclusion, facts: Facts, every: bool) -> str:
             silent = f"This does not tell how probable the others are: {most}. {plural(safe, 'run')} {how} too uneven to tell"
     if every:
         silent = "This is a sum over all combinations: none is unseen"
+        if found.drawn_combinations:
+            silent = "This is a sum over all combinations: what its random draws have not met is in its interval"
+            return silent + ", as is what seeds may decide"
         silent += ", and what seeds may decide is in its interval"
         silent += ", though no repeat came out otherwise" if always_agree(found) else ""
     elif found.low == 0.0 and found.hits:
