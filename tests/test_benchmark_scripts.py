@@ -45,6 +45,7 @@ SMALLEST = {
     "ahead.py": "--seeds 1 --budget 40",
     "fuzz.py": "--configurations 2 --scenarios 1",
     "few_values.py": "logarithms --seeds 1",
+    "tight_sums.py": "--problems exact@90 --seeds 1",
     "gates.py": "--problems box_3 --seeds 1 --budget 120 --table {folder}/gates.jsonl",
     "jumps.py": "--problems disc_count --seeds 1 --budget 30",
     "kernels.py": "--problems metaball --runs 40 --seeds 1",
