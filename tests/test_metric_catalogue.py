@@ -255,6 +255,9 @@ def test_course_against_a_circle():
     np.testing.assert_allclose(turn, 0.1, atol=1e-3)
     assert lateral_error_max(line)(trace) == pytest.approx(1.5, abs=1e-4)
     assert heading_error_max(line)(trace) == pytest.approx(0.1, abs=1e-3)
+    circuit = np.array([[0.0, 0.0], [20.0, 0.0], [20.0, 20.0], [-20.0, 20.0], [-20.0, -40.0]])
+    down = deviation(record(path(-19.5, 0.0, -math.pi / 2), path()).actor("ego"), circuit)  # where the first segment would lead
+    assert (down[0][0], down[1][0]) == pytest.approx((0.5, 0.0))
     beyond = deviation(record(path(-7.0, 2.0, math.pi), path()).actor("ego"), np.array([[0.0, 0.0], [10.0, 0.0]]))
     assert (beyond[0][0], beyond[1][0]) == (2.0, math.pi)
     with pytest.raises(ValueError, match="at least two points"):

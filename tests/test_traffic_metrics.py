@@ -270,3 +270,14 @@ def test_a_metric_of_a_trace_in_which_the_other_comes_and_goes_is_that_of_the_ti
         alone = [trace.select(slice(None), {"ego": "ego", name: "co"}) for name in trace.actors[1:]]
         assert pet_ego_first()(trace) == min(pet_ego_first()(one) for one in alone)
     assert touched >= 5, "nothing was there to be missed"
+
+
+def test_who_is_not_seen_for_a_moment_after_the_contact_has_collided_all_the_same():
+    """The next stretch began with overlapping rectangles, and counted as one of its own: a distance of -4 m."""
+    whole = traffic(lead=(25.0, 0.0, 10.0, ALL))
+    gap = traffic(lead=(25.0, 0.0, 10.0, np.flatnonzero(np.arange(N) != 28)))
+    assert len(joint_intervals(gap, "v", "lead")) == 1
+    for metric in (longitudinal.d_min(), ttc_min(), distance_min(), drac_max(), collision()):
+        assert in_traffic(metric, "v")(gap) == in_traffic(metric, "v")(whole)
+    before = traffic(lead=(25.0, 0.0, 10.0, np.flatnonzero(np.arange(N) != 8)))
+    assert len(joint_intervals(before, "v", "lead")) == 2

@@ -126,7 +126,7 @@ def lateral_metrics(curve: Curve, ego: str = "ego") -> tuple[Metric, ...]:
 def deviation(actor: ActorTrace, line: Points) -> tuple[Vector, Vector]:
     """Return the deviation of an actor's centre from the nearest point of a polyline.
 
-    The first and the last segment are extended beyond the ends.
+    Beyond an end of it the line goes on straight, where no other part of it is nearer than that end.
 
     Args:
         actor: t instants.
@@ -145,15 +145,17 @@ def deviation(actor: ActorTrace, line: Points) -> tuple[Vector, Vector]:
     if len(points) < 2 or not (square > 0).all():
         raise ValueError("a line must have at least two points, each apart from the next")
     dx, dy = actor.x[:, None] - points[:-1, 0], actor.y[:, None] - points[:-1, 1]  # (t, n - 1)
+    along = (dx * segment[:, 0] + dy * segment[:, 1]) / square
+    share = np.clip(along, 0.0, 1.0)
+    nearest = np.hypot(dx - share * segment[:, 0], dy - share * segment[:, 1]).argmin(axis=1)
     low, high = np.zeros(len(segment)), np.ones(len(segment))
     low[0], high[-1] = -np.inf, np.inf
-    share = np.clip((dx * segment[:, 0] + dy * segment[:, 1]) / square, low, high)
-    off = np.hypot(dx - share * segment[:, 0], dy - share * segment[:, 1])
-    nearest = off.argmin(axis=1)
     rows = np.arange(len(nearest))
+    share = np.clip(along[rows, nearest], low[nearest], high[nearest])
+    off = np.hypot(dx[rows, nearest] - share * segment[nearest, 0], dy[rows, nearest] - share * segment[nearest, 1])
     left = segment[nearest, 0] * dy[rows, nearest] - segment[nearest, 1] * dx[rows, nearest]
     turn = actor.heading - np.arctan2(segment[nearest, 1], segment[nearest, 0])
-    return np.copysign(off[rows, nearest], left), -np.arctan2(np.sin(-turn), np.cos(turn))
+    return np.copysign(off, left), -np.arctan2(np.sin(-turn), np.cos(turn))
 
 
 def _largest(name: str, error: int, unit: str, description: str, line: ArrayLike, ego: str) -> Metric:
