@@ -102,6 +102,17 @@ def test_oncoming_traffic_that_passes_between_two_instants_is_as_near_as_it_is(s
         assert rss_lateral_min()(trace) == pytest.approx(1.4 - 0.25, abs=1e-3)
 
 
+@pytest.mark.parametrize("gap", [0.1, 1.0])
+def test_who_stands_before_and_after_the_step_in_which_it_passes_is_as_near_as_it_is(gap):
+    """Slopes of the steps beside it said that nothing happens between."""
+    t = np.arange(6.0)
+    x = np.column_stack([np.zeros(6), np.where(t < 3, -20.0, 20.0)])
+    y = np.column_stack([np.zeros(6), np.full(6, 1.8 + gap)])
+    still = np.zeros_like(x)
+    trace = Trace(t, ("ego", "co"), x, y, still, still, still, np.full(2, 5.0), np.full(2, 1.8))
+    assert distance_min()(trace) == pytest.approx(gap, abs=1e-3)
+
+
 @settings(max_examples=40, deadline=None)
 @given(st.floats(-math.pi, math.pi), st.floats(-4.0, 4.0), st.floats(2.0, 20.0), st.floats(2.0, 20.0), st.floats(0.0, 0.5))
 def test_the_smallest_distance_of_straight_drives_is_that_of_small_steps(heading, aside, speed, other, offset):

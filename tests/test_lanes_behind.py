@@ -11,6 +11,7 @@ from own_networks import run_program
 from test_evidence import deaf, simulation, vehicle
 
 from sbt.problem.trace import ActorTrace, Trace
+from sbt.sumo.trailing import TrailingBody
 from sbt.sumo.user_simulation import Loop, step_until_over
 
 pytestmark = pytest.mark.sumo
@@ -139,3 +140,22 @@ def test_a_body_that_overtakes_on_an_opposite_lane_is_behind_its_front(tmp_path:
     assert truck.y[0] > 0.0, "it is on the opposite lane"
     assert body(truck, 0)[:, 0] == pytest.approx([truck.x[0] + dx for dx in (6.0, 2.0, -2.0, -6.0)], abs=0.3)
     assert [part.heading[0] for part in truck.parts] == pytest.approx([0.0] * 4, abs=0.1)
+
+
+def test_a_body_that_moves_sideways_on_its_lane_does_so_evenly_however_long_the_step():
+    """Its tail jumped to the new lateral place at the begin of a step of a second, and was kinked by 19 degrees."""
+
+    def aside(t: float) -> float:
+        return float(np.interp(t, [2.0, 5.0], [0.0, 3.2]))
+
+    def driven_on(step: float) -> dict[int, np.ndarray]:
+        def lane(front: tuple[float, float]) -> list[tuple[float, float]]:
+            return [(float(x), front[1]) for x in np.arange(np.ceil(front[0]) - 1.0, front[0] - 18.0, -1.0)]
+
+        truck = TrailingBody(16.5, lane)
+        at = {round(t, 6): truck.move((10.0 * t, aside(t)), 1.0, 0.0, "e_0", 10.0 * step) for t in np.arange(0.0, 8.01, step)}
+        return {k: truck.poses([at[float(k)]])[0] for k in range(3, 8)}
+
+    fine, coarse = driven_on(0.05), driven_on(1.0)
+    for k, poses in fine.items():
+        np.testing.assert_allclose(coarse[k], poses, atol=0.01)

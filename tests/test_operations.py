@@ -165,7 +165,7 @@ def test_no_row_is_of_traffic_that_was_edited_while_the_campaign_ran(tmp_path: P
     """Runs load SUMO's files anew: what was run before is kept, and the rows are the same once the file is put back."""
     (tmp_path / "a.net.xml").write_text(net({"road": [(0.0, 0.0), (900.0, 0.0)]}))
     traffic = tmp_path / "traffic.rou.xml"
-    lead = vehicle("lead", "road", "slow", departPos=300)
+    lead = vehicle("lead", "road", "slow", departPos=100, departSpeed=5)
     traffic.write_text(f'<routes><vType id="slow" sigma="0" maxSpeed="5"/>{lead}</routes>')
     ego = vehicle("ego", "road", "own", departPos=20, departSpeed="${v}")
     (tmp_path / "ego.rou.xml").write_text(f'<routes><vType id="own" sigma="0" maxSpeed="30"/>{ego}</routes>')
@@ -174,7 +174,7 @@ def test_no_row_is_of_traffic_that_was_edited_while_the_campaign_ran(tmp_path: P
 
     def edit(progress: sbt.Progress) -> None:
         if progress.done >= 8:
-            traffic.unlink(missing_ok=True) if gone else traffic.write_text(before.replace("300", "200"))
+            traffic.unlink(missing_ok=True) if gone else traffic.write_text(before.replace("100", "90"))
 
     asked = {"campaign": "coverage", "budget": 24, "batch": 6, "seed": 5, "executor": executor, "report": False}
     with pytest.raises(InputError, match=r"SUMO's files must stay .* but changed: .*traffic.rou.xml; put it back"):
@@ -183,6 +183,8 @@ def test_no_row_is_of_traffic_that_was_edited_while_the_campaign_ran(tmp_path: P
     traffic.write_text(before)
     whole = sbt.run(scenario=tmp_path / "scenario.yaml", store=tmp_path / "s", **asked)
     undisturbed = sbt.run(scenario=tmp_path / "scenario.yaml", store=tmp_path / "t", **asked)
+    assert (whole.frame["status"] == "ok").all()
+    assert whole.frame["y.distance_min"].between(1.0, 100.0).all()
     columns = [name for name in whole.frame if name != "seconds"]
     assert whole.frame[columns].equals(undisturbed.frame[columns])
 

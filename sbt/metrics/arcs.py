@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 
 from sbt.metrics.discs import is_person
-from sbt.problem.arrays import Vector
+from sbt.problem.arrays import Mask, Vector
 from sbt.problem.trace import ActorTrace
 
 __all__ = [
-    "SWING", "after_shares", "at_times", "finer", "is_coarse", "on_arcs", "parts_of_passing", "parts_of_swing", "parts_of_turns",
-    "swings",
+    "SWING", "after_shares", "at_times", "finer", "is_coarse", "on_arcs", "parts_of_swing", "parts_of_turns",
+    "swings", "while_passing",
 ]  # fmt: skip
 
 SWING = 0.3
@@ -75,13 +76,13 @@ def parts_of_swing(swing: float) -> int:
     return parts
 
 
-def parts_of_passing(a: ActorTrace, b: ActorTrace) -> int:
-    """Return into how many parts steps are divided so that two pass each other in four or more of them; a power of two."""
-    way = float(np.fmax.reduce(np.hypot(np.diff(b.x - a.x), np.diff(b.y - a.y)), initial=0.0))
-    parts = 1
-    while parts * 0.25 * (a.length + b.length) < way and parts < _MOST_PASSING:
-        parts *= 2
-    return parts
+def while_passing(a: ActorTrace, b: ActorTrace, where: Mask) -> tuple[ActorTrace, ActorTrace]:
+    """Return two actors between the instants of some steps (t - 1,), so often that who passes the other is seen beside it."""
+    way, far = np.hypot(np.diff(b.x - a.x), np.diff(b.y - a.y)), 0.25 * (a.length + b.length)
+    (steps,) = (where & (way > far)).nonzero()
+    parts = min(math.ceil(float(way[steps].max(initial=0.0)) / far), _MOST_PASSING)
+    step, share = np.repeat(steps, max(parts - 1, 0)), np.tile(np.arange(1, parts) / max(parts, 1), len(steps))
+    return after_shares(a, step, share), after_shares(b, step, share)
 
 
 def _swing(actor: ActorTrace) -> float:

@@ -7,8 +7,9 @@ import math
 import numpy as np
 
 from sbt.metrics.arcs import on_arcs
+from sbt.metrics.discs import is_person
 from sbt.metrics.geometry import part_pairs, rectangle_distance, select_instants
-from sbt.problem.arrays import Vector
+from sbt.problem.arrays import Mask, Vector
 from sbt.problem.trace import ActorTrace
 
 __all__ = ["least_distance"]
@@ -19,6 +20,8 @@ _SHARES, _ROUNDS = 16, 2
 """Half the parts of a step that are compared at a time, and how often; those about the best are divided again."""
 _SLOPE = 0.01
 """Share of a step from which on slopes at its ends are taken."""
+_CHANGES = 0.25
+"""Share by which a way may differ from the one before so that slopes tell of the step between."""
 _TURNED = 0.05
 """A step in which no point moves farther than this because its rectangle turns has one heading (m)."""
 
@@ -52,7 +55,7 @@ def _least_of_rectangles(a: ActorTrace, b: ActorTrace, least: float) -> float:
     least = float(np.fmin.reduce(distance[rows], initial=least))
     (steps,) = (into & (distance[1:] + distance[:-1] - chord < 2.0 * (least - _EXACT))).nonzero()
     if steps.size:
-        steps = steps[~(_extended(distance, steps) >= least - _EXACT)]
+        steps = steps[~(_steady(dx, dy, steps) & (_extended(distance, steps) >= least - _EXACT))]
     if steps.size:
         steps = steps[_bound(a, b, steps, distance) < least - _EXACT]
     if not steps.size:
@@ -61,6 +64,14 @@ def _least_of_rectangles(a: ActorTrace, b: ActorTrace, least: float) -> float:
     if turned.any():
         found[turned] = np.maximum(found[turned], _within(a, b, steps[turned], bend=True))
     return float(np.fmin.reduce(found, initial=least))
+
+
+def _steady(dx: Vector, dy: Vector, steps: np.ndarray) -> Mask:
+    """Return (n,) whether two move relative to each other in steps much as in the steps before and after."""
+    x, y = (np.pad(d[1:] - d[:-1], 1, constant_values=np.nan) for d in (dx, dy))
+    before, here, after = ((x[steps + k], y[steps + k]) for k in range(3))
+    most = _CHANGES * np.hypot(*here)
+    return np.logical_and(*(np.hypot(here[0] - beside[0], here[1] - beside[1]) < most for beside in (before, after)))
 
 
 def _extended(distance: Vector, steps: np.ndarray) -> Vector:
@@ -87,7 +98,9 @@ def _met(begin: Vector, end: Vector, falls: Vector, rises: Vector) -> Vector:
 
 
 def _turned(actor: ActorTrace, steps: np.ndarray) -> Vector:
-    """Return (n,) how far a corner moves in some steps because its rectangle turns (m)."""
+    """Return (n,) how far a corner moves in some steps because its rectangle turns (m); SUMO turns persons at once."""
+    if is_person(actor):
+        return np.zeros(len(steps))
     half = 0.5 * (actor.heading[steps + 1] - actor.heading[steps])
     return np.asarray(np.abs(np.sin(half)) * math.hypot(actor.length, actor.width))
 

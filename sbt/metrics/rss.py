@@ -16,7 +16,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from sbt.errors import InputError
-from sbt.metrics.arcs import finer, parts_of_passing
+from sbt.metrics.arcs import while_passing
 from sbt.metrics.exposure import integral
 from sbt.metrics.geometry import part_pairs
 from sbt.metrics.longitudinal import FAR
@@ -187,10 +187,11 @@ def rss_lateral_min(ego: str = "ego", other: str = "co", rules: Rss = DEFAULT) -
 
     def function(trace: Trace) -> float:
         own, co = trace.actor(ego), trace.actor(other)
-        parts = parts_of_passing(own, co)
-        own, co = finer(own, parts), finer(co, parts)
-        r = _relation(own, co)
-        return float(_margin_aside(r, co, rules)[r.gap < 0].min(initial=FAR))
+        r, way = _relation(own, co), np.hypot(np.diff(co.x - own.x), np.diff(co.y - own.y))
+        between = while_passing(own, co, r.gap[1:] + r.gap[:-1] < way)
+        within = _relation(*between)
+        least = float(_margin_aside(r, co, rules)[r.gap < 0].min(initial=FAR))
+        return float(_margin_aside(within, between[1], rules)[within.gap < 0].min(initial=least))
 
     return Metric(
         "rss_lateral_min", function, "m", "low", FAR,

@@ -121,15 +121,22 @@ class TrailingBody:
                 path.extend(point, 1e-3)
 
     def _between(self, before: Point, front: Point, chord: float) -> list[Point]:
-        """Return the points of the lanes between two fronts, the first one first."""
-        found, last, covered = list[Point](), front, 0.0
+        """Return points of the way between two fronts, the first one first: along the lanes, moving sideways evenly."""
+        points, along = [front], [0.0]
         for point in self._behind(front):
-            covered += math.dist(point, last)
-            if covered >= chord or math.dist(point, front) >= chord:
+            along.append(along[-1] + math.dist(points[-1], point))
+            points.append(point)
+            if along[-1] >= chord or math.dist(point, front) >= chord:
                 break
-            found.append(point)
-            last = point
-        return found[::-1]
+        if len(points) < 2:
+            return []
+        (x, y), (u, v) = points[-2:]
+        step = along[-1] - along[-2]
+        ux, uy = (u - x) / step, (v - y) / step
+        ahead = (before[0] - x) * ux + (before[1] - y) * uy
+        left = (before[1] - y) * ux - (before[0] - x) * uy  # of the lanes at the place where the front is now
+        share = left / max(along[-2] + ahead, 1e-3)
+        return [(p[0] - share * s * uy, p[1] + share * s * ux) for p, s in zip(points[-2:0:-1], along[-2:0:-1], strict=True)]
 
     def _begin(self, front: Point) -> None:
         """Begin a path that ends at the front: what is behind it has not been seen."""
