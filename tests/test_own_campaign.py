@@ -110,3 +110,34 @@ def test_a_recipe_that_raises_is_named(tmp_path):
 def test_a_reason_to_stop_is_text(tmp_path):
     with pytest.raises(sbt.InputError, match="stop must return why it is over, as text, or None, but got 5"):
         run(tmp_path, Mine([GOOD], reason=5))
+
+
+class Endless(Mine):
+    def stop(self, log):
+        return None
+
+
+@pytest.mark.parametrize(("size", "before"), [(3, 6), (4, 4), (7, 0)])
+def test_a_stage_that_goes_beyond_the_budget_is_named(size, before, tmp_path):
+    said = f"stage mine must stop within the budget of 6 runs, but proposed {size} after {before}$"
+    with pytest.raises(sbt.InputError, match=said):
+        run(tmp_path, Endless([GOOD] * size))
+    if before:
+        assert len(sbt.open(tmp_path / "s").frame) == before
+
+
+def test_confirmations_come_beside_the_budget(tmp_path):
+    class Confirming(Mine):
+        name = "confirm"
+
+        def stop(self, log):
+            return "confirmed" if len(log.history) >= 10 else None
+
+        def propose(self, log):
+            return sbt.Batch((sbt.PlannedRun("confirm", GOOD),) * 4)
+
+    def recipe(settings):
+        return sbt.Campaign((Mine([GOOD] * 6), Confirming([])), lambda log: (Found(len(log.history)), None))
+
+    result = sbt.run(campaign=recipe, scenario=SCENARIO, budget=6, store=tmp_path / "s", executor="serial", report=False)
+    assert result.conclusion.to_dict() == {"runs": 10}

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from sbt.campaigns.records import CONFIRM
 from sbt.campaigns.settings import Settings
 from sbt.errors import InputError, must_be, naming
 from sbt.loop.running import ahead_of
@@ -34,8 +35,7 @@ def checked(recipe: Callable[[Settings], object], settings: Settings) -> Campaig
         campaign = recipe(settings)
     if not isinstance(campaign, Campaign):
         raise InputError(f"{rule}, but returned {campaign!r}")
-    space = settings.scenario.space
-    return Campaign(tuple(_Checked(stage, space) for stage in campaign.stages), _concluding(campaign.conclude))
+    return Campaign(tuple(_Checked(stage, settings) for stage in campaign.stages), _concluding(campaign.conclude))
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,12 @@ class _Checked:
     """A stage of which every batch is checked."""
 
     stage: Stage
-    space: ParameterSpace
+    settings: Settings
+
+    @property
+    def space(self) -> ParameterSpace:
+        """Of the scenario."""
+        return self.settings.scenario.space
 
     @property
     def name(self) -> str:
@@ -69,9 +74,19 @@ class _Checked:
         with naming(rule):
             batch = self.stage.propose(log)
         must_be(rule, batch, Batch)
-        if isinstance(batch.runs, PlannedPoints):
-            return batch
-        return replace(batch, runs=tuple(self._checked(run) for run in batch.runs))
+        if not isinstance(batch.runs, PlannedPoints):
+            batch = replace(batch, runs=tuple(self._checked(run) for run in batch.runs))
+        self._check_budget(batch.runs, log)
+        return batch
+
+    def _check_budget(self, runs: Sequence[PlannedRun], log: Log) -> None:
+        """Refuse runs beyond the budget: those of the stage `confirm` come beside it, coarse ones and `reference` ones, too."""
+        s, spent = self.settings, int((log.planned.stage != CONFIRM).sum())
+        of_design = isinstance(runs, PlannedPoints) and runs.stage != CONFIRM
+        more = len(runs) if of_design else sum(run.stage != CONFIRM and not run.level for run in runs)
+        if more and spent + more > s.budget + s.reference:
+            rule = f"stage {self.name} must stop within the budget of {s.budget:,} runs"
+            raise InputError(f"{rule}, but proposed {more:,} after {spent:,}")
 
     def _checked(self, run: PlannedRun) -> PlannedRun:
         """Return a run with the inputs of the scenario, each a number in its range or one of its choices."""
