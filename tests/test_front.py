@@ -423,6 +423,14 @@ def test_the_check_finds_campaigns_that_remember_or_say_nothing():
         sbt.testing.check_campaign(sbt.CampaignKind("", silent, adaptive=False))
 
 
+def test_what_is_done_to_a_frame_stays_in_it(store):
+    result = sbt.open(store)
+    frame = result.frame
+    frame["own"], frame["margin"] = 1, 0.0
+    frame["critical"].array[:] = True
+    assert result.frame.equals(sbt.open(store).frame)
+
+
 def test_a_result_of_another_folder_is_the_same(store, tmp_path):
     shutil.copytree(store, tmp_path / "moved")
     assert sbt.open(tmp_path / "moved").frame.equals(sbt.open(store).frame)

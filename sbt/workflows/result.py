@@ -117,9 +117,13 @@ class Result(Generic[C]):
         found: Any = self.study.conclusion(self.summary["conclusion"])
         return found
 
-    @cached_property
+    @property
     def frame(self) -> pd.DataFrame:
-        """A row a run: x.<input>, y.<metric>, critical, margin, status, stage, iteration, seed, log_q, reason, ..."""
+        """A row a run: x.<input>, y.<metric>, critical, margin, status, stage, iteration, seed, log_q, ...; a copy each time."""
+        return self._frame.copy()
+
+    @cached_property
+    def _frame(self) -> pd.DataFrame:
         return with_judgements(self.history.to_frame(self.scenario.requirement), self.judgements)
 
     @cached_property
