@@ -147,6 +147,13 @@ def test_braking_with_a_limited_jerk_reaches_its_deceleration_and_final_speed() 
         assert -a.min() <= deceleration + 1e-9
 
 
+def test_a_remark_says_what_is_compared_and_whose_it_is() -> None:
+    (breach,) = (b for b in breaches(moving(STEADY, STILL, speed=np.full(30, 15.0))) if b.law == "mismatch")
+    told = "mismatch (difference between the speed and the distance driven per step, beyond 10 %) 3.5 m/s of ego, "
+    assert breach.told(["ego"]) == f"{told}the ego, at {breach.time:.2f} s, above 0.5 m/s"
+    assert breach.told(["av"]).startswith(f"{told}not the ego, at ")
+
+
 def test_check_tells_a_user_which_laws_an_own_scenario_breaks(tmp_path: Path) -> None:
     (tmp_path / "own.py").write_text(
         "import numpy as np\nfrom sbt import Parameter, Requirement, Scenario\nfrom sbt.problem.trace import Trace\n\n\n"
@@ -162,7 +169,8 @@ def test_check_tells_a_user_which_laws_an_own_scenario_breaks(tmp_path: Path) ->
     told = next(f for f in findings if "laws of motion" in f.rule)
     assert told.ok
     assert told.detail.startswith("in 2 of 3 runs: ")
-    assert "sideways must be <= 1.5 m/s, but ego has" in told.detail
+    what = "sideways (speed across the heading beyond 0.2 of the speed along it)"
+    assert f"{what} 13.5 m/s of ego, the ego, at 1.10 s, above 1.5 m/s" in told.detail
     scenario = ScenarioSpec(f"{tmp_path}/own.py:SCENARIO").resolve()
     check_physics(scenario.simulate({"aside": 0.0}, 0))
     with pytest.raises(ContractError, match=r"sideways must be <= 1\.5 m/s, but ego has 31 m/s at 1\.10 s"):
@@ -192,8 +200,8 @@ def test_check_tells_why_somebody_jumps_beside_its_lane(tmp_path: Path, speed: s
         "SCENARIO = Scenario('own', [Parameter('a', 0.0, 3.5, 'm')], Requirement('x_max', high=-1.0), simulate, [x_max])\n"
     )
     told = next(f for f in check_scenario(ScenarioSpec(f"{tmp_path}/own.py:SCENARIO")) if "laws of motion" in f.rule).detail
-    assert "lateral must be" in told
-    assert ("sideways must be" in told) == bool(cause)
+    assert "lateral (acceleration across the heading, mean of 0.5 s)" in told
+    assert ("sideways (" in told) == bool(cause)
     causes = ("SUMO changes lanes within a step unless", "who stands there parks, or leaves its place")
     assert [one for one in causes if one in told] == ([cause] if cause else [])
 

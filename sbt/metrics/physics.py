@@ -77,6 +77,12 @@ class Breach:
         unit = f" {self.unit}" if self.unit else ""
         return f"{self.law} must be <= {self.limit:g}{unit}, but {self.actor} has {self.value:.3g}{unit} at {self.time:.2f} s"
 
+    def told(self, egos: Sequence[str]) -> str:
+        """Return the breach as a remark: what is compared, and whether it is one of the egos."""
+        unit, what = f" {self.unit}" if self.unit else "", LAWS[self.law].description.partition(";")[0]
+        who = f"{self.actor}, {'the' if self.actor in egos else 'not the'} ego, at {self.time:.2f} s"
+        return f"{self.law} ({what}) {self.value:.3g}{unit} of {who}, above {self.limit:g}{unit}"
+
 
 def breaches(trace: Trace, scripted: Sequence[str] = ()) -> tuple[Breach, ...]:
     """Return every law that the trace breaks.
@@ -249,7 +255,7 @@ LAWS: Mapping[str, Law] = {
     "sideways": Law(DRIFT, "m/s", sideways, "speed across the heading beyond 0.2 of the speed along it; 1.5 is a quick lane "
                     "change"),
     "jerk": Law(50.0, "m/s^3", jerk, "rate of the acceleration, mean of 0.2 s; brakes build up full force in 0.2 s"),
-    "mismatch": Law(0.5, "m/s", mismatch, "difference between recorded speed and motion, beyond 10 %"),
+    "mismatch": Law(0.5, "m/s", mismatch, "difference between the speed and the distance driven per step, beyond 10 %"),
     "walking": Law(4.0, "m/s", walking, "speed of a person from step to step; a running child"),
     "start": Law(0.0, "", overlap, "contact at the start"),
     "braking_of_others": Law(6.0, "m/s^2", braking_of_others, "braking of drivers who do not have the ego ahead; more is "

@@ -43,7 +43,7 @@ _CORNERS_UP_TO = 4
 """With more inputs than this, every input goes to its ends alone instead of all 2^d corners."""
 _FEW_INVALID = 0.25
 """Largest share of the centre and corners that may be invalid."""
-_INSTANTLY = "; SUMO changes lanes within a step unless its option lanechange.duration is set (such as 3 s)"
+_INSTANTLY = "; lane changes do that: SUMO changes lanes within a step unless its option lanechange.duration is set (such as 3 s)"
 _PARKS = "; who stands there parks, or leaves its place, or changes lanes in a queue, which SUMO does within a step"
 _STANDS = 0.1
 """Speed below which who jumps beside its lane may park (m/s)."""
@@ -72,7 +72,7 @@ class _Run:
 
     metrics: tuple[tuple[str, float], ...] = ()
     digest: str = ""
-    breaches: tuple[str, ...] = ()
+    breaches: tuple[Breach, ...] = ()
     problem: str = ""
     length: float = math.inf
     teleports: tuple[str, ...] = ()
@@ -220,7 +220,7 @@ def _run(scenario: LogicalScenario, execute: Callable[[], Trace | dict[str, floa
         length = float(result.time[-1] - result.time[0])
         moved = tuple(text.removeprefix(TELEPORTED) for text in result.unconfirmed if text.startswith(TELEPORTED))
         measured = tuple(scenario.measure(result).items())
-        return _Run(measured, _digest(result), tuple(map(str, broken)), length=length, teleports=moved, beside=beside)
+        return _Run(measured, _digest(result), broken, length=length, teleports=moved, beside=beside)
     except RunError as error:
         return _Run(problem=f"{error.status}: {error.reason}")
     except BaseException as error:
@@ -358,14 +358,15 @@ def _physics(runs: list[_Run], points: list[dict[str, Value]], spec: ScenarioSpe
     if not broken:
         return []
     share = f"{sum(bool(run.breaches) for run in runs)} of {len(runs)} runs"
-    first = {breach.partition(" must")[0]: (breach, values) for breach, values in broken[::-1]}
-    detail = "; ".join(f"{breach} ({written(values)})" for breach, values in first.values())
+    first, roles = {breach.law: (breach, values) for breach, values in broken[::-1]}, spec.resolve().roles
+    egos = roles.ego, *roles.also_tested
+    detail = "; ".join(f"{breach.told(egos)} ({written(values)})" for breach, values in first.values())
     options = getattr(getattr(spec.resolve().simulate, "files", None), "options", {})
     causes = dict.fromkeys(run.beside for run in runs if run.beside)
     detail += "".join(cause for cause in causes if cause != _INSTANTLY or "lanechange.duration" not in options)
-    if any(name.startswith("walking") for name in first):
+    if "walking" in first:
         detail += _MOVED
-    return [Finding("for information: laws of motion are broken", ok=True, detail=f"in {share}: {detail}")]
+    return [Finding("for information: beyond the laws of motion", ok=True, detail=f"in {share}: {detail}")]
 
 
 def _slow(seconds: float, runs: int) -> list[Finding]:
