@@ -182,6 +182,16 @@ def test_mistakes_in_the_files_are_reported_before_any_run(study, changes, messa
     assert not (path.parent / "results").exists()
 
 
+@pytest.mark.parametrize("need", ["metric: ttc_min, critical: [0, 1]", "any: [{metric: ttc_min, critical: [0, 1]}]"])
+def test_a_scenario_without_metrics_is_told_so_once(study, need):
+    path = study()
+    text = re.sub(r"(?ms)^metrics:.*?^(?=\w)|^requirement:.*", "", path.read_text())
+    path.write_text(f"{text}\nrequirement: {{{need}}}\n")
+    code, output = check(path)
+    assert (code, output.count("scenario.yaml:"), "needs at least one metric" in output) == (2, 1, True), output
+    assert ("metrics: [ttc_min]" in output) == need.startswith("metric")
+
+
 def test_a_scenario_is_no_campaign(study):
     done = CliRunner().invoke(app, ["run", str(study())])
     assert (done.exit_code, "this is a scenario" in done.output) == (2, True)

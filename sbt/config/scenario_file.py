@@ -314,7 +314,8 @@ class _Builder:
         key: tuple[str, ...] = ("requirement",) if need.stl is None else ("requirement", "stl")
         entries = [*self._model.metrics, *(MetricEntry.model_validate({"stl": text, "name": name}) for name, text in formulas)]
         if not entries:
-            self._problems.add(("metrics",), "a scenario needs at least one metric, but has none")
+            such = f"; that of its requirement is metrics: [{need.metric}]" if need.metric is not None else ""
+            self._problems.add(("metrics",), f"a scenario needs at least one metric, but has none{such}")
         for k, entry in enumerate(entries):
             path = ("metrics", k) if k < len(self._model.metrics) else key
             for metric in self._problems.attempt(path, partial(self._metrics_of, entry)) or ():
@@ -335,13 +336,13 @@ class _Builder:
         wanted, problems = self._model.requirement, self._problems
         names = [m.name for m in metrics]
         if wanted.combined is not None:
-            return combined_requirement(wanted, names, None, problems)
+            return combined_requirement(wanted, names, None, problems) if names else None  # which has been said
         if wanted.stl is not None:
             return Requirement("stl", *(wanted.critical or (-math.inf, 0.0)))
         if wanted.metric is None or wanted.critical is None:
             problems.add(("requirement",), "a requirement must have a metric and critical: [low, high]")
             return None
-        if wanted.metric not in names and len(names) >= len(self._model.metrics):
+        if names and wanted.metric not in names and len(names) >= len(self._model.metrics):
             problems.add(("requirement", "metric"), must_be_measured(wanted.metric, names))
         return Requirement(wanted.metric, *wanted.critical)
 
