@@ -12,6 +12,7 @@ import os
 import re
 import secrets
 import shutil
+import signal
 import socket
 import tempfile
 from contextlib import suppress
@@ -19,7 +20,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-__all__ = ["SCRATCH", "ProcessId", "machine", "own_name", "remove_abandoned", "scratch"]
+__all__ = ["SCRATCH", "ProcessId", "exit_words", "machine", "own_name", "remove_abandoned", "scratch"]
 
 SCRATCH = "SBT_SCRATCH"
 """Variable of the environment: the folder in which a worker makes its temporary folders; its driver removes it."""
@@ -54,6 +55,18 @@ class ProcessId:
         except PermissionError:
             pass
         return True
+
+
+def exit_words(code: int) -> str:
+    """Return how a process ended, by its exit code; a negative one is that of a signal.
+
+    >>> exit_words(-11), exit_words(3)
+    ('signal SIGSEGV', 'exit code 3')
+    """
+    if code >= 0:
+        return f"exit code {code}"
+    known = {int(one): one.name for one in signal.Signals}
+    return f"signal {known.get(-code, -code)}"
 
 
 def _start(pid: int) -> int | None:

@@ -205,9 +205,27 @@ def test_a_run_that_kills_its_worker_costs_itself_only(analytic: Path):
     work = jobs(40, lambda k: 0.01 if k == 7 else 0.5)
     found = run(LocalExecutor(spec(analytic), 2), work)
     assert [k for k, o in found.items() if o.status == Status.CRASHED] == [7]
-    assert found[7].reason == "the worker process died, also when this run was tried again alone"
+    assert found[7].reason == "the worker process died (exit code 7), also when this run was tried again alone"
     healthy = run(SerialExecutor(spec(analytic)), [job for job in work if job.index != 7])
     assert {k: o for k, o in found.items() if k != 7} == healthy
+
+
+def test_the_signal_that_ended_a_worker_is_told(tmp_path: Path):
+    file = tmp_path / "deadly.py"
+    file.write_text(textwrap.dedent("""
+        import os, signal
+        from sbt import Parameter, Requirement, Scenario
+        SIGNALS = [0, signal.SIGSEGV, signal.SIGABRT, signal.SIGRTMIN + 5]
+        def evaluate(values, seed):
+            if SIGNALS[seed]:
+                os.kill(os.getpid(), SIGNALS[seed])
+            return {"y": values["a"]}
+        SCENARIO = Scenario("deadly", [Parameter("a", 0, 1)], Requirement("y", high=0.0), evaluate=evaluate)
+    """))
+    found = run(LocalExecutor(spec(file, "SCENARIO"), 2), [Job(k, {"a": 0.5}, k) for k in range(4)])
+    told = [re.search(r"died \(signal (.*?)\)", found[k].reason) for k in range(1, 4)]
+    assert [one and one[1] for one in told] == ["SIGSEGV", "SIGABRT", str(signal.SIGRTMIN + 5)]
+    assert found[0].status == Status.OK
 
 
 def test_a_run_that_hangs_is_stopped_and_the_others_go_on(analytic: Path, monkeypatch: pytest.MonkeyPatch):

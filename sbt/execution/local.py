@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from sbt.errors import InputError, PluginError, SbtError, described
-from sbt.execution.pool import broken, close_pool, open_pool
+from sbt.execution.pool import broken, close_pool, how_ended, open_pool
 from sbt.execution.protocol import chunk_of
 from sbt.execution.spec import ScenarioSpec
 from sbt.execution.starting import start_apart
@@ -87,6 +87,8 @@ class LocalExecutor:
         self._memory, self._recycle = memory, recycle
         self._started = 0  # runs since the workers were
         self._pool: Any = None
+        self._processes: Mapping[int, Any] = {}  # of the pool
+        self._ended: Mapping[int, str] = {}  # how that of a run did which was at work when the last pool broke
         self._files: Mapping[str, str] = {}  # as the first workers read them
         self._scratch: tempfile.TemporaryDirectory[str] | None = None
         self._seconds = _TARGET
@@ -115,6 +117,7 @@ class LocalExecutor:
     def _start(self) -> None:
         self._pool, self._started = open_pool(self._workers, self._folder), 0
         ready = start_apart(self._prepare_all)  # an interruption between start and entry would leave a process to itself
+        self._processes = dict(self._pool._processes)
         wait(ready)
         for future in ready:
             if not isinstance(future.exception(), broken()):
@@ -167,7 +170,7 @@ class LocalExecutor:
         if cause is _Cause.LATE:
             reason = f"a run must take at most {self._timeout:g} s: its process was stopped"
             return Outcome(job.index, Status.TIMEOUT, {}, reason, level=job.level)
-        what = "the worker process died"
+        what = f"the worker process died{self._ended.get(job.index, '')}"
         if cause is _Cause.UNREADABLE:
             what = "the worker process could not hand over what it ran, as code of a run changed what it needs for that"
         if cause is _Cause.LARGE:
@@ -209,9 +212,11 @@ class LocalExecutor:
             return [], {}
         yield from self._rescued(submitted)
         missing = [job for chunk in submitted.values() for job in chunk] + list(queue)
-        dead = {index: _Cause.DIED for runs, _, _ in self._at_work() for index in runs} | stopped
+        at = {index: self._processes.get(pid) for runs, pid, _ in self._at_work() for index in runs}
+        dead = dict.fromkeys(at, _Cause.DIED) | stopped
         dead |= {index: _Cause.LARGE for index in dead if Path(self._folder, f"{_LARGE}{index}").exists()}
         self._restart()
+        self._ended = {index: how_ended(process) for index, process in at.items()}
         return missing, dead
 
     def _rescued(self, submitted: dict[Future[Any], list[Job]]) -> Iterator[list[Outcome]]:

@@ -33,9 +33,9 @@ from typing import Any, TypeVar
 from sbt.errors import InputError
 from sbt.execution.starting import TERMINAL_SIGNALS, start_apart
 from sbt.execution.streams import SteadyStream, open_missing
-from sbt.processes import SCRATCH, ProcessId
+from sbt.processes import SCRATCH, ProcessId, exit_words
 
-__all__ = ["broken", "close_pool", "open_pool"]
+__all__ = ["broken", "close_pool", "how_ended", "open_pool"]
 
 T = TypeVar("T")
 
@@ -92,6 +92,12 @@ def close_pool(pool: Any) -> None:
         while True:
             waiting.get_nowait()
     pool.shutdown(wait=True, kill_workers=True)
+
+
+def how_ended(process: Any) -> str:
+    """Return in brackets how a worker of a closed pool ended; "" where that is not known."""
+    code = None if process is None else process.exitcode
+    return "" if code is None else f" ({exit_words(code)})"
 
 
 def broken() -> type[BaseException]:

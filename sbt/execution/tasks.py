@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import as_completed
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 from sbt import interruption
 from sbt.errors import SbtError, described
-from sbt.execution.pool import broken, close_pool, open_pool
+from sbt.execution.pool import broken, close_pool, how_ended, open_pool
 from sbt.processes import scratch
 
 __all__ = ["DiedError", "each", "elsewhere"]
@@ -60,15 +60,19 @@ def elsewhere(seconds: float, function: Callable[P, R], *args: P.args, **kwargs:
         DiedError: the process died.
         TimeoutError: it took too long.
     """
+    processes: list[Any] = []
     with scratch("tasks") as folder:
         pool = open_pool(1, folder)
         try:
-            result: R = pool.submit(function, *args, **kwargs).result(seconds)
+            future = pool.submit(function, *args, **kwargs)
+            processes += pool._processes.values()
+            result: R = future.result(seconds)
+            return result
         except broken():
-            raise DiedError("the worker process died") from None
+            pass
         finally:
             close_pool(pool)
-    return result
+    raise DiedError(f"the worker process died{how_ended(next(iter(processes), None))}")
 
 
 def _tried(function: Callable[[T], None], item: T) -> str | None:

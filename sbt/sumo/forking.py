@@ -21,6 +21,7 @@ from typing import Any, TypeVar
 from sbt import interruption
 from sbt.errors import InputError, RunError, described
 from sbt.problem.outcome import Status
+from sbt.processes import exit_words
 
 __all__ = ["in_fork"]
 
@@ -105,8 +106,7 @@ def _answer(pid: int, read: int, limit: float | None, what: str) -> Any:
     if late:
         raise RunError(Status.TIMEOUT, f"{what} must take at most {limit:g} s: its process was stopped")
     if status != 0:
-        died = f"signal {signal.Signals(-status).name}" if status < 0 else f"exit code {status}"
-        raise RunError(Status.CRASHED, f"{what} must end by itself, but its process died ({died})")
+        raise RunError(Status.CRASHED, f"{what} must end by itself, but its process died ({exit_words(status)})")
     kind, answer = pickle.loads(b"".join(parts))
     if kind == "run":
         raise RunError(Status(answer[0]), answer[1])
