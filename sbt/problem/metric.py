@@ -16,6 +16,8 @@ from sbt.problem.trace import Trace
 
 __all__ = ["Metric", "meaningful", "metric_from"]
 
+_WITHIN = f" and within {FARTHEST:g}"
+
 
 @dataclass(frozen=True)
 class Metric:
@@ -102,8 +104,7 @@ def meaningful(name: str, value: object) -> float:
     number = as_number(name, value)
     if abs(number) <= FARTHEST or math.isinf(number):
         return number
-    limit = "" if math.isnan(number) else f" and within {FARTHEST:g}"
-    raise RunError(Status.FAILED, f"metric {name} must be finite{limit}, inf or -inf, but got {number}")
+    raise _unbounded(name, "" if math.isnan(number) else _WITHIN, str(number))
 
 
 def as_number(name: str, value: Any) -> float:
@@ -114,8 +115,14 @@ def as_number(name: str, value: Any) -> float:
     """
     try:
         number = None if isinstance(value, str | bytes) else float(value)
-    except (TypeError, ValueError, OverflowError):
+    except (TypeError, ValueError):
         number = None
+    except OverflowError:  # a whole number beyond all floats
+        raise _unbounded(name, _WITHIN, shown(value)) from None
     if number is None:
         raise RunError(Status.FAILED, f"metric {name} must be one number, but got {shown(value)}")
     return number
+
+
+def _unbounded(name: str, limit: str, got: str) -> RunError:
+    return RunError(Status.FAILED, f"metric {name} must be finite{limit}, inf or -inf, but got {got}")
