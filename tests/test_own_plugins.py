@@ -65,6 +65,23 @@ class Nearest:
         return predict
 
 
+def made(predict):
+    class M:
+        def fit(self, u, y, rng):
+            return predict
+
+    return M
+
+
+G = Prediction.gaussian
+shape = made(lambda v: G(np.zeros((len(v), 1)), np.ones((len(v), 1))))
+short = made(lambda v: G(np.zeros(len(v) - 1), np.ones(len(v) - 1)))
+nan = made(lambda v: G(np.full(len(v), np.nan), np.ones(len(v))))
+negative = made(lambda v: G(np.zeros(len(v)), -np.ones(len(v))))
+pair = made(lambda v: (np.zeros(len(v)), np.ones(len(v))))
+nothing = made(lambda v: None)
+
+
 class Tuple:
     def fit(self, u, y, rng):
         return lambda v: (np.zeros(len(v)), np.ones(len(v)))
@@ -337,9 +354,25 @@ def test_objects_and_recalibration_work_in_campaigns(run, folder):
 
 @pytest.mark.parametrize("campaign", ["boundary", "falsification", "estimation"])
 def test_what_is_no_prediction_is_said_with_the_metamodels_name(run, campaign):
-    with pytest.raises(Exception, match=r"metamodel Tuple .*must return a Prediction, .* but returned a tuple") as caught:
+    said = r"metamodel Tuple, fitted to .*must return a Prediction, .* but returned a tuple"
+    with pytest.raises(Exception, match=said) as caught:
         run(campaign=campaign, metamodel={"kind": "own.py:Tuple"})
     assert type(caught.value).__name__ == "SbtError"
+
+
+@pytest.mark.parametrize("campaign", ["boundary", pytest.param("falsification", marks=pytest.mark.slow),
+                                      pytest.param("estimation", marks=pytest.mark.slow)])  # fmt: skip
+@pytest.mark.parametrize(("name", "said"), [
+    ("shape", r"mu must have shape \(n,\), one value a point, but got \(\d+, 1\)"),
+    ("short", r"a predictor must return one value a point, but returned \d+ for \d+ points?"),
+    ("nan", "mean must be finite, but got nan"), ("negative", r"std must be finite and > 0, but got -1\.0"),
+    ("pair", r"a predictor must return a Prediction, such as Prediction\.gaussian\(mu, sigma\), but returned a tuple"),
+    ("nothing", r"a predictor must return a Prediction, such as Prediction\.gaussian\(mu, sigma\), but returned a NoneType"),
+])  # fmt: skip
+def test_what_is_no_prediction_is_one_kind_of_error_with_the_configured_name(run, campaign, name, said):
+    with pytest.raises(sbt.SbtError, match=rf"^metamodel {name}, fitted to \d+ rows: {said}$") as caught:
+        run(campaign=campaign, metamodel={"kind": f"own.py:{name}"})
+    assert type(caught.value) is sbt.SbtError
 
 
 REPEATS = 2

@@ -22,7 +22,7 @@ from sbt.config.space import configured_space
 from sbt.errors import InputError
 from sbt.execution.carrying import carry, keep_here
 from sbt.execution.spec import ScenarioSpec
-from sbt.metamodels.base import Metamodel, build
+from sbt.metamodels.base import Metamodel, build, call
 from sbt.metamodels.recalibrated import Recalibrated
 from sbt.plugins import OBJECT
 from sbt.problem.metric import metric_from
@@ -207,6 +207,8 @@ def _metamodel(loaded: Loaded, problems: Problems) -> Metamodel | None:
     if not isinstance(recalibrate, bool):
         problems.add(("metamodel", "recalibrate"), f"must be true or false, but got {recalibrate!r}")
     made: Metamodel | None = problems.attempt(("metamodel",), lambda: build(kind, choice.preset, settings))
+    if made is not None:
+        call(made, choice.kind)
     return Recalibrated(made) if recalibrate is True and made is not None else made
 
 

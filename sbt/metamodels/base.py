@@ -28,6 +28,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, Protocol, TypeVar, overload, runtime_checkable
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +39,7 @@ from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
 __all__ = [
-    "Metamodel", "Predictor", "Screened", "TargetAware", "build", "check_rows", "fitted", "gives_different", "is_rate",
+    "Metamodel", "Predictor", "Screened", "TargetAware", "build", "call", "check_rows", "fitted", "gives_different", "is_rate",
     "log_ambiguity_bound", "named_errors", "once", "predicted", "sample_paths", "simplest", "sketched", "split_validation",
     "standardise", "with_target", "without_repetitions",
 ]  # fmt: skip
@@ -132,6 +133,14 @@ def sample_paths(predictor: Predictor, u: Points, n: int, rng: np.random.Generat
 
 
 M = TypeVar("M")
+_called: WeakKeyDictionary[type, str] = WeakKeyDictionary()
+"""What classes of metamodels are called in configurations, which errors tell: a function may have made them."""
+
+
+def call(metamodel: Metamodel, name: str) -> None:
+    """Let errors of a metamodel of a user's own name it as a configuration does: `file.py:NAME` as NAME."""
+    if not type(metamodel).__module__.startswith("sbt."):
+        _called[type(metamodel)] = name.rpartition(":")[2]
 
 
 @overload
@@ -232,14 +241,18 @@ def _rule(declared: str, value: Any, stated: Iterable[Any]) -> str:
 
 @contextmanager
 def named_errors(metamodel: Metamodel, n: int) -> Iterator[None]:
-    """Return a context in which an error of a metamodel's own code names the metamodel, its n rows and the line (`naming`)."""
+    """Return a context in which an error of a metamodel's own code names the metamodel, its n rows and the line (`naming`).
+
+    Raises:
+        SbtError: it raises, or predicts what is no prediction.
+    """
     inner: Any = getattr(metamodel, "metamodel", metamodel) if type(metamodel).__module__.startswith("sbt.") else metamodel
-    name = type(inner).__name__  # of the user's own, whose errors these are, where another one wraps it
+    name = _called.get(type(inner), type(inner).__name__)  # of the user's own, whose errors these are, where another one wraps it
     with naming(f"metamodel {name} must learn from {n} rows and predict"):
         try:
             yield
         except PredictionError as error:
-            raise InputError(f"metamodel {name}, fitted to {n} rows: {error}") from error
+            raise SbtError(f"metamodel {name}, fitted to {n} rows: {error}") from error
 
 
 def fitted(metamodel: Metamodel, u: Points, y: Vector, rng: np.random.Generator) -> Predictor:
@@ -252,15 +265,16 @@ def predicted(predict: Predictor, u: Points) -> Prediction:
     """Return what a predictor says of points u (n, d); it may change the copy that it gets.
 
     Raises:
-        TypeError: it is no `Prediction`.
-        ValueError: it is one of another number of points.
+        PredictionError: it is no `Prediction`, or one of another number of points.
     """
     prediction, n = predict(u.copy()), len(u)
     if not isinstance(prediction, Prediction):
         kind = type(prediction).__name__
-        raise TypeError(f"a predictor must return a Prediction, such as Prediction.gaussian(mu, sigma), but returned a {kind}")
+        rule = "a predictor must return a Prediction, such as Prediction.gaussian(mu, sigma)"
+        raise PredictionError(f"{rule}, but returned a {kind}")
     if len(prediction) != n:
-        raise ValueError(f"a predictor must return a prediction of {n} points, but returned one of {len(prediction)}")
+        asked = "1 point" if n == 1 else f"{n} points"
+        raise PredictionError(f"a predictor must return one value a point, but returned {len(prediction)} for {asked}")
     return prediction
 
 

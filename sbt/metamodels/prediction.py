@@ -81,7 +81,7 @@ class Prediction:
             if getattr(self, name).shape != shape:
                 raise PredictionError(f"{name} must have shape {shape}, but got {getattr(self, name).shape}")
         if not np.isfinite(self.mean).all():
-            raise PredictionError("mean must be finite, but got NaN or infinity")
+            raise PredictionError(f"mean must be finite, but got {self.mean[~np.isfinite(self.mean)][0]}")
         if not ((self.std > 0) & (self.std < np.inf)).all():
             raise PredictionError(f"std must be finite and > 0, but got {_first_bad(self.std)}")
         if not ((self.noise >= 0) & (self.noise < np.inf)).all():
