@@ -166,6 +166,15 @@ def test_wrong_configuration_is_told_with_its_place(folder: Path):
     ]
 
 
+@pytest.mark.parametrize(
+    ("store", "said"), [("\udcc3s", r"printable characters, but got 2 of them: '\udcc3s'"), (" ", "must not be empty")]
+)
+def test_a_wrong_option_is_named_as_it_was_given(folder: Path, store: str, said: str):
+    done = call("run", "c.yaml", "--store", store)
+    assert (done.exit_code, done.output.count("--store: "), said in done.output) == (2, 1, True), done.output
+    assert "--set" not in done.output
+
+
 def test_what_only_the_scenario_tells_is_reported_with_the_wrong_keys(folder: Path):
     text = "campaign: boundary\nscenario: plane.py:SCENARIO\nbugdet: 10\ninputs: {gab: {max: 2.0}}\n"
     text += "requirement: {metric: margni}\n"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -30,7 +29,7 @@ def benchmark(
     """Compare metamodels on scenarios, with even and boundary samples, or go on where it was interrupted."""
     overrides = list(changes or [])
     if store is not None:
-        overrides.append(f"store={json.dumps(str(store))}")
+        overrides.append(f"--store={store}")
     if workers is not None:
         overrides.append(f"workers={workers}")
     silent = quiet or as_json

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from collections.abc import Mapping
@@ -66,7 +65,7 @@ def run(
     """Run a campaign, or resume it where it was interrupted."""
     overrides = list(changes or [])
     if store is not None:
-        overrides.append(f"store={json.dumps(str(store))}")
+        overrides.append(f"--store={store}")
     if workers is not None:
         overrides.append(f"executor.workers={workers}")
     with resumable() as work, clean_stdout(), ProgressDisplay(silent=quiet or as_json) as show:

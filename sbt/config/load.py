@@ -83,7 +83,7 @@ def load(
 
     Args:
         path: a YAML file.
-        overrides: `key.path=value` texts that replace or add single values, each value in YAML.
+        overrides: `key.path=value` texts that replace or add single values, each value in YAML; `--store=value` as it is.
         changes: keys that replace those of the file, with their values as plain data.
         objects: what was given in Python, by kind and name.
 
@@ -279,15 +279,15 @@ def schema() -> Json:
 def _overridden(data: Json, source: SourceMap, overrides: Sequence[str]) -> tuple[Json, SourceMap, list[str]]:
     """Return the data with the overrides in it, the source that knows them, and what is wrong with them."""
     wrong: list[str] = []
-    given: set[Key] = set(source.overrides)
+    given = dict(source.overrides)
     for text in overrides:
         dotted, equals, written = text.partition("=")
-        path = tuple(dotted.strip().split("."))
+        path, own = tuple(dotted.removeprefix("--").strip().split(".")), dotted.startswith("--")
         if not equals or not all(path):
             wrong.append(f"--set {text}: must be key.path=value, but got '{text}'")
             continue
         try:
-            value, _, doubled = read_yaml(written, f"--set {dotted}")
+            value, _, doubled = (written, None, []) if own else read_yaml(written, f"--set {dotted}")
         except ConfigError as error:
             reason = error.errors[0].partition(", but ")[2]
             wrong.append(f"--set {dotted}: the value must be YAML, but got '{written}' ({reason})")
@@ -298,8 +298,8 @@ def _overridden(data: Json, source: SourceMap, overrides: Sequence[str]) -> tupl
         except TypeError as error:
             wrong.append(f"--set {dotted}: {error}")
             continue
-        given.add(path)
-    return data, replace(source, overrides=frozenset(given)), wrong
+        given[path] = dotted if own else f"--set {'.'.join(path)}"
+    return data, replace(source, overrides=given), wrong
 
 
 def _with(data: Any, path: tuple[str, ...], value: Any) -> Json:

@@ -70,18 +70,18 @@ class Place:
 
 @dataclass(frozen=True)
 class SourceMap:
-    """Places of the keys in one file, and the keys that `--set` gave.
+    """Places of the keys in one file, and the keys that options gave.
 
     Args:
         name: the file, as the user wrote it.
         places: by path of keys.
-        overrides: paths that `--set` gave.
+        overrides: what gave the paths that options did, such as `--set budget` or `--store`.
         texts: unquoted values as they are written, by path: `007` where YAML reads the number 7.
     """
 
     name: str
     places: Mapping[Key, Place] = field(default_factory=dict)
-    overrides: frozenset[Key] = frozenset()
+    overrides: Mapping[Key, str] = field(default_factory=dict)
     texts: Mapping[Key, str] = field(default_factory=dict)
 
     def located(self, key: str | Key, message: str, *, at_key: bool = False) -> str:
@@ -103,9 +103,8 @@ class SourceMap:
         dotted = ".".join(str(part) for part in path)
         for prefix in (path[:n] for n in range(len(path), -1, -1)):
             if prefix in self.overrides:
-                given = ".".join(str(part) for part in prefix)
                 inner = "" if prefix == path else f" {dotted}:"
-                return (1, 0, 0), f"--set {given}:{inner} {message}"
+                return (1, 0, 0), f"{self.overrides[prefix]}:{inner} {message}"
             if prefix in self.places:
                 place = self.places[prefix]
                 line, column = place.key if at_key and prefix == path else place.value
@@ -113,7 +112,7 @@ class SourceMap:
                 return (0, line, column), f"{self.name}:{line}:{column}:{subject} {message}"
             below = min((given for given in self.overrides if given[: len(prefix)] == prefix), default=None)
             if below is not None:  # what is written nowhere else came with it
-                return (1, 0, 0), f"--set {'.'.join(map(str, below))}: {dotted}: {message}"
+                return (1, 0, 0), f"{self.overrides[below]}: {dotted}: {message}"
         return (0, 0, 0), f"{self.name}: {dotted}: {message}"
 
 

@@ -13,7 +13,7 @@ from sbt.errors import SbtError
 
 __all__ = ["further_mistakes"]
 
-_AT_KEY = re.compile(r"(?:--set |.*?:\d+:\d+: )(?P<key>\w+)")
+_AT_KEY = re.compile(r"(?:--(?:set )?|.*?:\d+:\d+: )(?P<key>\w+)")
 """The key at the top that an error of a configuration is about."""
 _ANY, _OF_ANY = "falsification", (
     "scenario", "metamodel", "inputs", "correlation", "constraints", "features", "metrics", "requirement", "ego",
