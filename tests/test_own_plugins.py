@@ -116,6 +116,15 @@ class Wide:
 WIDE = Wide()
 
 
+def nowhere(prediction, critical, log_density):
+    return np.full(len(log_density), -np.inf)
+
+
+@greedy
+def nowhere_greedily(prediction, critical, log_density):
+    return np.full(len(log_density), -np.inf)
+
+
 def broken(prediction, critical, log_density):
     return prediction.sgima  # marked
 
@@ -383,8 +392,18 @@ REPEATS = 2
 @pytest.mark.parametrize("kind", ["importance", "own.py:score"])
 def test_scores_above_zero_are_drawn_from(run, campaign, kind):
     """The density on [0, 0.5]^2 is 4, and so is the largest score of `importance`; log sigma has no bound."""
-    _, x = run(campaign=campaign, acquisition={"kind": kind}, metamodel={"kind": "own.py:Nearest"}, validation={"share": 0})
+    result, x = run(campaign=campaign, acquisition={"kind": kind}, metamodel={"kind": "own.py:Nearest"}, validation={"share": 0})
+    assert result.conclusion.unscored is None
     assert len(np.unique(x, axis=0)) >= 60 - REPEATS
+
+
+@pytest.mark.parametrize("campaign", ["boundary", "falsification"])
+@pytest.mark.parametrize("kind", ["own.py:nowhere", "own.py:nowhere_greedily"])
+def test_an_acquisition_that_scores_nothing_is_told(run, campaign, kind):
+    result, _ = run(campaign=campaign, acquisition={"kind": kind}, metamodel={"kind": "own.py:Nearest"})
+    assert result.conclusion.unscored == 2
+    said = "The acquisition scored nothing above -inf in 2 batches: what it was to choose there is spread evenly."
+    assert result.sentences[-1] == said
 
 
 @pytest.mark.parametrize("campaign", ["boundary", pytest.param("falsification", marks=pytest.mark.slow)])

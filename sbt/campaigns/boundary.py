@@ -26,6 +26,7 @@ from sbt.campaigns.regions import CriticalRegion, critical_regions
 from sbt.campaigns.repeats import SimulatorNoise, simulator_noise, stated_noise
 from sbt.campaigns.settings import CampaignKind, Settings
 from sbt.campaigns.telling import tell_boundary
+from sbt.campaigns.unscored import unscored_batches, unscored_words
 from sbt.campaigns.warmed import conditional_on
 from sbt.campaigns.wording import plural, requirement_words
 from sbt.errors import InputError
@@ -75,6 +76,7 @@ class BoundaryConclusion:
         over_traffic: P(critical) is the mean over the traffic that seeds draw; None: what inputs alone tell.
         unused_seeds: runs whose seeds were chosen although P(critical) is not learned from what they draw; None: there are none.
         chance_place: where runs of a noisy simulator are critical most often, though not most of them are; None: most are.
+        unscored: batches of which the acquisition scored no run above -inf; None: there are none.
     """
 
     critical_fraction: float | None
@@ -103,6 +105,7 @@ class BoundaryConclusion:
     chance_place: ChancePlace | None = optional()
     over_traffic: OverTraffic | None = optional()
     unused_seeds: int | None = optional()
+    unscored: int | None = optional()
 
     def to_dict(self) -> Json:
         """Return the JSON of the command line."""
@@ -135,7 +138,7 @@ class BoundaryConclusion:
             found.append(unused_words(self.unused_seeds))
         if self.doubt is not None:
             found.append(self.doubt.sentence())
-        return found
+        return [*found, *unscored_words(self.unscored)]
 
 
 def recipe(settings: Settings) -> Campaign:
@@ -180,6 +183,7 @@ def recipe(settings: Settings) -> Campaign:
             None if every is not None else critical_combinations(log_odds, settings.scenario, fitted.log_success),
             _by_chance(log_odds, log.history, settings) if every is None else None,
             over_traffic(fitted, log.history), None if r.over_traffic else int((~log.history.drawn).sum()) or None,
+            unscored_batches(log),
         ), fitted  # fmt: skip
 
     most = largest_batch if settings.acquisition is None else None

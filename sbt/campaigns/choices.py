@@ -17,6 +17,7 @@ from sbt.campaigns.exploration import about_regions, exploration_share, explore,
 from sbt.campaigns.records import BatchProposal
 from sbt.campaigns.repeats import simulator_noise
 from sbt.campaigns.settings import Acquisition, Settings
+from sbt.campaigns.unscored import are_unscored
 from sbt.errors import InputError
 from sbt.loop.learner import FittedMetamodel
 from sbt.loop.stages import Log
@@ -80,7 +81,7 @@ def from_roi(settings: Settings, fitted: FittedMetamodel | None, log: Log, n: in
     """
     acquisition = settings.acquisition if settings.acquisition is not None else boundary
     draw, x = _draw(settings, fitted, acquisition, log, n)
-    return Chosen(x, _proposal(draw))
+    return Chosen(x, replace(_proposal(draw), unscored=_unscored(settings, fitted, acquisition, x)))
 
 
 def greedily(settings: Settings, fitted: FittedMetamodel | None, log: Log, n: int) -> Chosen:
@@ -93,7 +94,9 @@ def greedily(settings: Settings, fitted: FittedMetamodel | None, log: Log, n: in
     if len(x) == n:
         return Chosen(x, BatchProposal("greedy", start, looked))
     draw, rest = _draw(settings, fitted, even, log, n - len(x), taken=x)
-    return Chosen(np.concatenate([x, rest]), BatchProposal("greedy", draw.next_position, looked, even=len(rest)))
+    every = np.concatenate([x, rest])
+    unscored = _unscored(settings, fitted, acquisition, every)
+    return Chosen(every, BatchProposal("greedy", draw.next_position, looked, even=len(rest), unscored=unscored))
 
 
 def mixed(settings: Settings, fitted: FittedMetamodel | None, log: Log, n: int) -> Chosen:
@@ -219,6 +222,12 @@ def _score(settings: Settings, fitted: FittedMetamodel | None, acquisition: Acqu
     if fitted is None or acquisition is even:
         return lambda u: np.zeros(len(u))
     return _score_by(settings, fitted, acquisition, fitted.predict)
+
+
+def _unscored(settings: Settings, fitted: FittedMetamodel | None, acquisition: Acquisition, x: Points) -> int | None:
+    """Return how many of the runs (n, d) an acquisition was to choose and did not; None where it did."""
+    u = np.clip(settings.scenario.space.to_unit(x), 0.0, 1.0)
+    return len(x) if are_unscored(_score(settings, fitted, acquisition), u) else None
 
 
 def _rough_score(settings: Settings, fitted: FittedMetamodel, acquisition: Acquisition) -> Callable[[Points], Vector] | None:

@@ -25,6 +25,7 @@ from sbt.campaigns.records import CONFIRM, LINK, RACE
 from sbt.campaigns.repeats import SimulatorNoise, simulator_noise, stated_noise
 from sbt.campaigns.settings import Settings
 from sbt.campaigns.telling import tell_failures
+from sbt.campaigns.unscored import unscored_batches, unscored_words
 from sbt.campaigns.warmed import conditional_on
 from sbt.campaigns.ways import OpenWays, links_told, open_ways, runs_between
 from sbt.campaigns.wording import percent, plural
@@ -113,6 +114,7 @@ class FalsificationConclusion:
         earlier: what a campaign of another setup told; None: there is none.
         critical_inputs: different inputs of the critical runs; None: of each its own.
         crowded: of inputs whose distribution lies in a small part of their range, the share that holds half of it; None: of none.
+        unscored: batches of which the acquisition scored no run above -inf; None: there are none.
     """
 
     first_critical_run: int | None
@@ -133,6 +135,7 @@ class FalsificationConclusion:
     earlier: EarlierTold | None = optional()
     critical_inputs: int | None = optional()
     crowded: Mapping[str, float] | None = optional()
+    unscored: int | None = optional()
 
     @property
     def look_at(self) -> int | None:
@@ -160,7 +163,7 @@ class FalsificationConclusion:
         said += [] if self.fidelity is None else [self.fidelity.sentence()]
         said += [] if self.earlier is None else self.earlier.sentences()
         judged = [mode.preventable for mode in self.failure_modes if mode.preventable]
-        return [*said, *count_avoided(judged), *conditional_on(facts.history)]
+        return [*said, *count_avoided(judged), *conditional_on(facts.history), *unscored_words(self.unscored)]
 
 
 class FailureSearch:
@@ -264,6 +267,7 @@ class FailureSearch:
             explained_variance(self.settings, history, (history.iteration == 0) | (history.stage == VALIDATION)),
             raced=len(raced) or None, links=links_told(log, scenario.requirement, left, stand_for),
             critical_inputs=inputs if inputs < len(hits) else None, crowded=crowded_inputs(scenario.space),
+            unscored=unscored_batches(log),
         )  # fmt: skip
 
 

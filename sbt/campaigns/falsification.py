@@ -21,6 +21,7 @@ from sbt.campaigns.records import SearchProposal
 from sbt.campaigns.repeats import REPEAT, repeats_wanted
 from sbt.campaigns.screening import ScreenStage
 from sbt.campaigns.settings import CampaignKind, Settings
+from sbt.campaigns.unscored import UNSCORED, are_unscored
 from sbt.errors import InputError
 from sbt.loop.learner import FittedMetamodel
 from sbt.loop.stages import Batch, Campaign, Log, Stage
@@ -186,7 +187,7 @@ class SearchStage:
         if n == 0:
             return Picks(np.empty((0, space.dimension)), ())
         if s.acquisition is not None:
-            return Picks(self._scored(log, n), ())
+            return self._scored(log, n)
         if s.method == "cma_es":
             return self._evolved(runs, u, n)
         if s.method == "portfolio" and s.covariates is not None and len(runs.training) > 1:
@@ -220,7 +221,7 @@ class SearchStage:
         ]
         return evolution.propose(u[int(np.argmin(begin))], generations, n, s.seed, s.scenario.space.cube)
 
-    def _scored(self, log: Log, n: int) -> Points:
+    def _scored(self, log: Log, n: int) -> Picks:
         """Return n points by an acquisition function: drawn in proportion to exp(score), or greedily."""
         s = self.failure_search.settings
         if s.learner is None or s.acquisition is None:
@@ -237,10 +238,12 @@ class SearchStage:
 
         feasible = self.failure_search.search.feasible
         if fitted is not None and is_greedy(score):
-            return self._greedily(scored, fitted, log, n)
-        sobol = SobolSequence(space.dimension, s.seed + 1)  # not the one that fills space
-        start = 2**20 * log.iteration
-        return rejection(scored, sobol, n, start=start, seed=s.seed, label=log.iteration, accept_filter=feasible).u
+            u = self._greedily(scored, fitted, log, n)
+        else:
+            sobol = SobolSequence(space.dimension, s.seed + 1)  # not the one that fills space
+            start = 2**20 * log.iteration
+            u = rejection(scored, sobol, n, start=start, seed=s.seed, label=log.iteration, accept_filter=feasible).u
+        return Picks(u, (UNSCORED,) * n if are_unscored(scored, u) else ())
 
     def _greedily(self, score: Callable[[Points], Vector], fitted: FittedMetamodel, log: Log, n: int) -> Points:
         """Return the n points of the highest scores that are far from each other and from earlier runs."""

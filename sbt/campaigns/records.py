@@ -37,6 +37,7 @@ class BatchProposal:
         even: of a greedy batch, runs that fill the space because nothing else was left.
         repeats: runs that repeat inputs with other seeds: the last ones of the batch before those held out.
         pairs: runs before these whose seeds were chosen by what they draw.
+        unscored: runs that an acquisition of -inf everywhere was to choose: they fill the space.
     """
 
     method: str
@@ -52,6 +53,7 @@ class BatchProposal:
     even: int | None = optional()
     repeats: int | None = optional()
     pairs: int | None = optional()
+    unscored: int | None = optional()
 
 
 @dataclass(frozen=True)
