@@ -58,7 +58,9 @@ def oracle(term: Term, signals: dict[str, np.ndarray], time: np.ndarray, i: int)
         case Unary("F", of, low, high):
             return max(at(of, j) for j in window(low, high))
         case Binary("U", p, q, low, high):
-            return max(min([at(q, j), *(at(p, k) for k in range(i, j))]) for j in window(low, high))
+            # the first s of a sample is its time or t + low: p of the sample itself counts where the window begins within it
+            begun = [j + int(time[j] < time[i] + low) for j in range(len(time))]
+            return max(min([at(q, j), *(at(p, k) for k in range(i, begun[j]))]) for j in window(low, high))
         case Binary(op, left, right):
             f, g = at(left, i), at(right, i)
             pointwise = {
@@ -112,6 +114,17 @@ def test_samples_need_not_be_even(text, values, steps):
     term = parse(text)
     expected = [oracle(term, signals, time, i) for i in range(len(time))]
     np.testing.assert_allclose(robustness(term, signals.__getitem__, time), expected, rtol=1e-12, atol=1e-12)
+
+
+def test_until_holds_over_the_sample_in_which_its_window_begins():
+    """That sample was passed over: what held on [0, 1) alone was taken to hold when the window begins at .5 s."""
+    time, a, b = np.arange(5.0), np.array([-1.0, 4.0, 4.0, 4.0, 4.0]), np.array([3.0, -1.0, -1.0, -1.0, -1.0])
+    assert rho("(a > 0) U[0.5,2] (b > 0)", time, a=a, b=b)[0] == -1.0
+    assert rho("(a > 0) U[0,2] (b > 0)", time, a=a, b=b)[0] == 3.0
+    longer = np.arange(21.0), *(np.append(v, np.full(16, v[-1])) for v in (b, a))
+    for within in ("[6,20]", "[4,20]", "[3.5,9]"):  # the last state holds for ever, as if it were written out
+        text = f"(a > 0) U{within} (b > 0)"
+        assert rho(text, time, a=b, b=a)[2] == rho(text, longer[0], a=longer[1], b=longer[2])[2] == -1.0
 
 
 @given(formulas, formulas, bounds, samples)

@@ -109,7 +109,8 @@ def robustness(term: Term, signals: Callable[[str], Vector], time: Vector) -> Ve
             return _highest(robustness(of, signals, time), *_window(time, low, high))
         case Binary("U", left, right, low, high):
             first, last = _window(time, low, high)
-            return _until(robustness(left, signals, time), robustness(right, signals, time), first, last)
+            held = np.where(time[first] < time + low - _TIME_TOLERANCE, first, first - 1)
+            return _until(robustness(left, signals, time), robustness(right, signals, time), first, last, held)
         case Binary(op, left, right):
             with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # Metric refuses infinity and NaN
                 return _POINTWISE[op](robustness(left, signals, time), robustness(right, signals, time))
@@ -141,15 +142,16 @@ def _highest(values: Vector, first: Indices, last: Indices) -> Vector:
     return result
 
 
-def _until(left: Vector, right: Vector, first: Indices, last: Indices) -> Vector:
+def _until(left: Vector, right: Vector, first: Indices, last: Indices, held: Indices) -> Vector:
     """Return the (n,) robustness of `left U right` as the minimum of three simpler terms.
 
-    `right` somewhere in the window, `left` up to its start, and an unbounded until from there on.
+    `right` somewhere in the window, `left` over the samples up to its start, the last of which is `held` (n,), and an
+    unbounded until from there on.
     """
     pairs = zip(left[::-1].tolist(), right[::-1].tolist(), strict=True)
     backwards = accumulate(pairs, lambda after, now: max(now[1], min(now[0], after)), initial=-np.inf)
     unbounded = np.array(list(backwards)[:0:-1])
     result = np.minimum(_highest(right, first, last), unbounded[first])
     now = np.arange(len(left))
-    before = -_highest(-left, now, np.maximum(first - 1, now))
-    return np.where(first > now, np.minimum(result, before), result)
+    before = -_highest(-left, now, np.maximum(held, now))
+    return np.where(held >= now, np.minimum(result, before), result)
