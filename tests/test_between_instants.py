@@ -11,9 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sbt.metrics.around import smallest_distance
+from sbt.metrics.exposure import tet, tit
 from sbt.metrics.planar import distance_min, post_encroachment_time, severity, time_behind
 from sbt.metrics.rss import rss_lateral_min
 from sbt.metrics.shifts import evenly
+from sbt.metrics.rss import Rss, rss_lateral_min, rss_violation
 from sbt.problem.trace import Trace
 
 Way = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
@@ -123,3 +125,16 @@ def test_the_smallest_distance_of_straight_drives_is_that_of_small_steps(heading
     fine = distance_min()(trace_of(ways, (5.0, 1.8), 0.005, 6.0))
     coarse = distance_min()(trace_of(ways, (5.0, 1.8), 0.5, 6.5, offset - 0.5))
     assert coarse == pytest.approx(fine, abs=0.03 if fine else 1e-9)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.floats(5.0, 20.0), st.floats(3.0, 4.5), st.sampled_from((0.1, 0.2, 0.5, 1.0)))
+def test_exposure_ends_with_the_contact_within_the_step(speed, contact, step):
+    """Of an ego that drives into who stands: 3 s below 3 s, in which TTC falls evenly to 0."""
+    length = 12.0
+    ways = {"ego": straight(0.0, 0.0, 0.0, speed), "co": straight(speed * contact + length, 0.0, 0.0, 0.0)}
+    trace = trace_of(ways, (length, 1.8), step, 6.0)
+    assert tit()(trace) == pytest.approx(4.5, abs=step**2 / 8.0 + 1e-6)
+    assert tet()(trace) == pytest.approx(3.0, abs=step / 2.0 + 1e-6)
+    assert rss_violation(rules=Rss(response=5.0))(trace) == pytest.approx(contact, abs=1e-6)
+    assert tit()(trace.select(slice(0, math.floor(contact / step + 1e-9) + 2))) == tit()(trace)

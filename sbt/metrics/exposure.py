@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from sbt.metrics.geometry import contact_moment
 from sbt.metrics.longitudinal import encounter, first_contact, time_to_collision
 from sbt.problem.arrays import Mask, Vector
 from sbt.problem.metric import Metric
@@ -16,13 +17,17 @@ THRESHOLD = 3.0
 
 
 def integral(trace: Trace, values: Vector | Mask, ego: str, other: str) -> float:
-    """Return the time integral of (t,) values until the end or the first contact of the two.
+    """Return the time integral of (t,) values until the end or the first contact of the two, which may lie within a step.
 
     For a condition it is the time during which it holds (s); a step at whose ends it differs counts half.
     """
-    k = first_contact(trace, ego, other)
-    end = len(trace.time) if k is None else k + 1
-    return float(np.trapezoid(values[:end].astype(np.float64), trace.time[:end]))
+    k, time = first_contact(trace, ego, other), trace.time
+    if k == 0:
+        return 0.0
+    if k is not None:
+        moment = contact_moment(trace.actor(ego), trace.actor(other), k)
+        time = np.append(time[:k], time[k - 1] + moment * (time[k] - time[k - 1]))
+    return float(np.trapezoid(values[: len(time)].astype(np.float64), time))
 
 
 def _shortfall(trace: Trace, ego: str, other: str, margin: float, threshold: float) -> Vector:
