@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from sbt.metrics.around import smallest_distance
 from sbt.metrics.exposure import tet, tit
+from sbt.metrics.paths import smallest_ttc_on_paths, ttc_on_paths
 from sbt.metrics.planar import distance_min, post_encroachment_time, severity, time_behind
 from sbt.metrics.rss import rss_lateral_min
 from sbt.metrics.shifts import evenly
@@ -138,3 +139,30 @@ def test_exposure_ends_with_the_contact_within_the_step(speed, contact, step):
     assert tet()(trace) == pytest.approx(3.0, abs=step / 2.0 + 1e-6)
     assert rss_violation(rules=Rss(response=5.0))(trace) == pytest.approx(contact, abs=1e-6)
     assert tit()(trace.select(slice(0, math.floor(contact / step + 1e-9) + 2))) == tit()(trace)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.floats(9.0, 30.0), st.floats(0.35, 0.6), st.sampled_from((0.3, 0.8, -0.3)), st.sampled_from((1, -1)), st.booleans())
+def test_who_turns_is_on_its_arc_from_instant_to_instant(radius, rate, gap, side, short):
+    """A post beside what a car sweeps, or just in it, has the TTC of small steps, also where the post goes before."""
+    length, width, post = 4.5, 1.8, 0.5
+    edge = radius - width / 2 - gap if side < 0 else math.hypot(radius + width / 2, length / 2) + gap
+    at = -1.5 + rate * 3.7  # between instants
+    spot = (edge + side * post / 2) * np.array([math.cos(at), math.sin(at)])
+    ways = {"ego": bend(radius, rate * radius, -1.5), "co": lambda t: (*(np.full(len(t), v) for v in spot), np.full(len(t), at))}
+
+    def seen(step: float) -> Trace:
+        trace = trace_of(ways, (length, width), step, 8.0)
+        speed = np.stack([np.full(len(trace.time), rate * radius), np.zeros(len(trace.time))], axis=1)
+        states = {name: getattr(trace, name).copy() for name in ("x", "y", "heading")}
+        if short:
+            for v in (*states.values(), speed):
+                v[trace.time > 2.0 + 1e-9, 1] = np.nan
+        sizes = np.array([length, post]), np.array([width, post])
+        return Trace(trace.time, trace.actors, *states.values(), speed, 0.0 * speed, *sizes)
+
+    coarse, fine = seen(1.0), seen(0.1)
+    assert ttc_on_paths(coarse)[:3] == pytest.approx(ttc_on_paths(fine)[:21:10], abs=0.03)
+    assert (ttc_on_paths(coarse)[:3] == 5.0).all() == (gap > 0.0)
+    if gap > 0.0:
+        assert smallest_ttc_on_paths(coarse) == 5.0

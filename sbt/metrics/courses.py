@@ -12,6 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
+from sbt.metrics.arcs import finer, parts_of_turns
 from sbt.problem.arrays import Vector
 from sbt.problem.trace import ActorTrace
 
@@ -25,24 +26,30 @@ _STRIDE = 5
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """A rectangle and the path on which it drives while it is recorded, and along its way after that."""
+    """A rectangle and the path on which it drives while it is recorded, and along its way after that.
+
+    Args:
+        actor: the rectangle.
+        step: longest time between two of its instants (s); where it turns far in one, it drives on arcs, else on chords.
+    """
 
     actor: ActorTrace
+    step: float = 0.0
 
     @cached_property
     def x(self) -> Vector:
         """Of the path (m)."""
-        return self._joined(0, self.actor.x)
+        return self._path.x
 
     @cached_property
     def y(self) -> Vector:
         """Of the path (m)."""
-        return self._joined(1, self.actor.y)
+        return self._path.y
 
     @cached_property
     def heading(self) -> Vector:
         """Along the path (rad), without jumps."""
-        heading = self._joined(2, self.actor.heading)
+        heading = self._path.heading
         return heading if np.ptp(heading) < np.pi else np.unwrap(heading)
 
     @cached_property
@@ -52,14 +59,32 @@ class Course:
         return np.concatenate([[0.0], np.cumsum(np.hypot(x[1:] - x[:-1], y[1:] - y[:-1]))])
 
     @cached_property
+    def begin(self) -> Vector:
+        """Distance along the path of each instant (m)."""
+        return self.way[: len(self.actor.x) * self._parts : self._parts]
+
+    @cached_property
     def leaves(self) -> bool:
         """Whether it leaves the road at the end of the path."""
         way = self.actor.way
         return way is not None and len(way) > 0 and bool(np.isnan(way[-1, 0]))
 
-    def _joined(self, column: int, recorded: Vector) -> Vector:
-        way = self.actor.way
-        return recorded if way is None else np.concatenate([recorded, way[~np.isnan(way[:, 0]), column]])
+    @cached_property
+    def _points(self) -> ActorTrace:
+        actor, way = self.actor, self.actor.way
+        if way is None:
+            return actor
+        on = way[:-1] if self.leaves else way
+        x, y, heading = np.concatenate([[actor.x, actor.y, actor.heading], on.T], axis=1)
+        return ActorTrace(x, y, heading, x, x, actor.length, actor.width)  # of speeds a path knows nothing
+
+    @cached_property
+    def _parts(self) -> int:
+        return parts_of_turns([self._points], self.step)
+
+    @cached_property
+    def _path(self) -> ActorTrace:
+        return finer(self._points, self._parts)
 
 
 _Steps = tuple[float, np.ndarray, np.ndarray, np.ndarray]
@@ -153,7 +178,7 @@ class _Side:
             self._at = np.cumsum([0, *(len(course.actor.x) for course in courses)])[pair] + instant
         counts = [len(course.actor.x) for course in courses]
         self._origin = np.repeat([paths.origin[course] for course in courses], counts)
-        self._begin = self._origin + np.concatenate([c.way[:n] for c, n in zip(courses, counts, strict=True)])
+        self._begin = self._origin + np.concatenate([course.begin for course in courses])
         self._speed = np.concatenate([course.actor.speed for course in courses])
         self._known = self._positions(slice(None), np.arange(len(self._begin))) if shared else None
 

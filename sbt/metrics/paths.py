@@ -61,7 +61,7 @@ def ttc_on_paths(trace: Trace, ego: str = "ego", other: str | None = "co") -> Ve
     """
     met = list(_together(trace, ego, other))
     times = np.full(len(trace.time), HORIZON)
-    for instants, found in _predicted_contacts(met):
+    for instants, found in _predicted_contacts(trace, met):
         np.minimum.at(times, instants, found)
     for one in met:
         if one.contact is not None:
@@ -76,7 +76,7 @@ def smallest_ttc_on_paths(trace: Trace, ego: str = "ego") -> float:
     met = list(_together(trace, ego, None))
     if any(one.contact is not None for one in met if one.trace is not trace):
         return 0.0
-    return min((float(found.min()) for _, found in _predicted_contacts(met, only_smallest=True)), default=HORIZON)
+    return min((float(found.min()) for _, found in _predicted_contacts(trace, met, only_smallest=True)), default=HORIZON)
 
 
 def _together(trace: Trace, ego: str, other: str | None) -> Iterator[_Together]:
@@ -93,22 +93,26 @@ def _together(trace: Trace, ego: str, other: str | None) -> Iterator[_Together]:
                 yield _Together(instants.start, part, "ego", "co")
 
 
-def _predicted_contacts(met: Sequence[_Together], *, only_smallest: bool = False) -> Iterator[tuple[np.ndarray, Vector]]:
+def _predicted_contacts(
+    trace: Trace, met: Sequence[_Together], *, only_smallest: bool = False
+) -> Iterator[tuple[np.ndarray, Vector]]:
     """Yield (n,) instants, and (n,) times until two rectangles touch on their paths from then on (s), at most the horizon.
 
     Args:
-        met: who is there together.
+        trace: t instants.
+        met: who is there together in it.
         only_smallest: larger times than the smallest one need not be exact, or be there.
     """
     pairs: list[tuple[Course, Course]] = []
     first: list[int] = []
+    step = max(np.diff(trace.time).tolist(), default=0.0)
     own: dict[tuple[int, int, int], list[Course]] = {}  # by trace and stretch
     for one in met:
         for at, ego, other in between_changes(one.trace, one.ego, one.other):
             stretch = id(one.trace), at, len(ego.x)
             if stretch not in own:
-                own[stretch] = [Course(each) for each in rectangles(ego)]
-            others = [Course(each) for each in rectangles(other)]
+                own[stretch] = [Course(each, step) for each in rectangles(ego)]
+            others = [Course(each, step) for each in rectangles(other)]
             pairs += [(a, b) for a in own[stretch] for b in others]
             first += [one.first + at] * (len(pairs) - len(first))
     begins, least = np.array(first), HORIZON
@@ -161,7 +165,7 @@ def _predicted(courses: Sequence[Course], rows: np.ndarray, after: np.ndarray) -
     for begin, end in pairwise([0, *ends, len(courses)]):
         course = courses[begin]
         way, heading = course.way, course.heading
-        travelled = way[rows[begin:end], None] + course.actor.speed[rows[begin:end], None] * after[begin:end]
+        travelled = course.begin[rows[begin:end], None] + course.actor.speed[rows[begin:end], None] * after[begin:end]
         x, y = np.interp(travelled, way, course.x), np.interp(travelled, way, course.y)
         beyond = travelled - way[-1]
         if beyond.max() > 0.0:
@@ -174,7 +178,6 @@ def _predicted(courses: Sequence[Course], rows: np.ndarray, after: np.ndarray) -
     turned = np.abs(headings[:, 1] - headings[:, 0]) * (0.5 * np.hypot(size[:, 0], size[:, 1]))
     now = Rectangles(x[:, 1], y[:, 1], headings[:, 1], size[:, 0], size[:, 1])
     return (x[:, 0], y[:, 0]), now, turned
-
 
 
 def path_of(actor: ActorTrace) -> tuple[Vector, Vector, Vector]:
