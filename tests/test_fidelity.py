@@ -370,6 +370,25 @@ def test_the_budget_is_kept(tmp_path: Path, scenario: str, budget: int, cost: fl
     assert budget - 2.0 < spent <= budget + 1e-9
 
 
+def test_where_coarse_runs_tell_nothing_but_inputs_do_these_draw_the_rest(tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text(
+        "import sbt\nfrom sbt.seeds import stream\n"
+        "def scenario(name):\n"
+        "    return sbt.Scenario(name, inputs=[sbt.Parameter('a', 0, 1)], requirement=sbt.Requirement('y', high=0.2),\n"
+        "        evaluate=lambda values, seed: {'y': values['a'] + 0.1 * float(stream(seed, name).normal())})\n"
+        "FINE, COARSE = scenario('fine'), scenario('coarse')\n"
+    )
+    own = {**NOISY, "scenario": str(tmp_path / "own.py:FINE"), "budget": 200}
+    summary = run(tmp_path / "told", own, fidelity={"scenario": str(tmp_path / "own.py:COARSE"), "cost": 0.5})
+    told = summary.conclusion
+    assert any("do not clearly pay" in sentence for sentence in summary.sentences)
+    with Store.read(tmp_path / "told" / "store") as store:
+        drawn = store.history().where(store.history().stage == "estimation")
+    assert np.ptp(drawn.log_q) > 0.5, "not those of crude Monte Carlo"
+    assert told.low < 0.2 < told.high
+    assert told.high - told.low < 2.0 * 1.96 * np.sqrt(0.16 / len(drawn)), "and narrower than its interval"
+
+
 def test_where_coarse_runs_tell_nothing_the_rest_is_crude_monte_carlo(tmp_path: Path) -> None:
     """And where nothing critical is met, hardly a run is spent on what a belief promises."""
     (tmp_path / "own.py").write_text(
