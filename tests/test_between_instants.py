@@ -14,9 +14,8 @@ from sbt.metrics.around import smallest_distance
 from sbt.metrics.exposure import tet, tit
 from sbt.metrics.paths import smallest_ttc_on_paths, ttc_on_paths
 from sbt.metrics.planar import distance_min, post_encroachment_time, severity, time_behind
-from sbt.metrics.rss import rss_lateral_min
-from sbt.metrics.shifts import evenly
 from sbt.metrics.rss import Rss, rss_lateral_min, rss_violation
+from sbt.metrics.shifts import evenly
 from sbt.problem.trace import Trace
 
 Way = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]

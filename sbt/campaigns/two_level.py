@@ -2,8 +2,8 @@
 
 A round is two batches: coarse runs of a pool of pairs, then runs of the scenario, drawn by what the coarse ones tell. That is
 done only where coarse runs clearly pay, by runs that the beliefs had not seen; and pairs are drawn by what inputs tell only where
-that clearly pays. Where neither does, a round is one batch from the inputs' distribution, as in crude Monte Carlo. While nothing critical
-was met, most runs are of that kind: they bound the probability. The budget counts a coarse run as its cost.
+that clearly pays. Where neither does, a round is one batch from the inputs' distribution, as in crude Monte Carlo. While nothing
+critical was met, most runs are of that kind: they bound the probability. The budget counts a coarse run as its cost.
 """
 
 from __future__ import annotations
