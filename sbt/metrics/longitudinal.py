@@ -10,6 +10,7 @@ Driving: A Review and Suitability Analysis of the State of the Art, doi 10.1007/
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,9 +23,9 @@ from sbt.problem.metric import Metric
 from sbt.problem.trace import ActorTrace, Trace
 
 __all__ = [
-    "BESIDE", "DRAC_LIMIT", "FAR", "HORIZON", "OVERTAKEN", "Encounter", "collision", "d_min", "drac_max", "encounter",
-    "first_contact", "impact_speed", "longitudinal_metrics", "relative_speed_at_contact", "thw_min", "time_to_collision",
-    "ttc_min",
+    "BESIDE", "DRAC_LIMIT", "FAR", "HORIZON", "OVERTAKEN", "Encounter", "Signal", "collision", "d_min", "drac_max", "encounter",
+    "first_contact", "gap", "impact_speed", "longitudinal_metrics", "relative_speed_at_contact", "thw", "thw_min",
+    "time_to_collision", "ttc", "ttc_min",
 ]  # fmt: skip
 
 HORIZON = 10.0
@@ -37,6 +38,8 @@ FAR = 1000.0
 """Gap of road users that never share a path (m)."""
 DRAC_LIMIT = 100.0
 """Largest DRAC reported (m/s^2); the formula has no limit as the gap approaches 0."""
+Signal = Callable[[Trace, str, str, float], Vector]
+"""Of a trace, ego, another road user and the margin of the path (m): (t,) numbers."""
 _MOMENTS = 1001
 """Times within the step of a contact at which speeds are looked at."""
 
@@ -131,20 +134,24 @@ def time_to_collision(e: Encounter) -> Vector:
     """Return the (t,) time to collision along the ego's heading (s); meaningful where the other is in the path."""
     closes = e.closing > 0
     ratio = e.gap / np.where(closes, e.closing, np.inf)
-    ttc = np.where(closes, np.minimum(ratio, HORIZON), HORIZON)
+    values = np.where(closes, np.minimum(ratio, HORIZON), HORIZON)
     if e.beside.any():
-        ttc = np.where(e.beside, np.where(closes, np.maximum(ratio, BESIDE), BESIDE), ttc)
-    if e.contact is not None and e.rear_end:
-        ttc[e.contact] = 0.0
-    return ttc
+        values = np.where(e.beside, np.where(closes, np.maximum(ratio, BESIDE), BESIDE), values)
+    return values
 
 
-def _ttc_min(trace: Trace, ego: str, other: str, margin: float, passed: float) -> float:
+def _smallest(signal: Signal, trace: Trace, ego: str, other: str, margin: float, passed: float) -> float:
+    """Return the smallest value of a signal, `passed` if the ego had passed the other before it entered the path."""
     e = encounter(trace, ego, other, margin)
-    shared = e.ahead | e.beside
-    if not shared.any():
-        return passed if e.overtaken else HORIZON
-    return float(time_to_collision(e)[shared].min())
+    if e.overtaken and not (e.ahead | e.beside).any():
+        return passed
+    return float(signal(trace, ego, other, margin).min())
+
+
+def ttc(trace: Trace, ego: str, other: str, margin: float) -> Vector:
+    """Return the (t,) time to collision along the ego's heading (s)."""
+    e = encounter(trace, ego, other, margin)
+    return e.after_contact(np.where(e.ahead | e.beside, time_to_collision(e), HORIZON), 0.0)
 
 
 def ttc_min(ego: str = "ego", other: str = "co", margin: float = 0.0, passed: float = OVERTAKEN) -> Metric:
@@ -154,19 +161,16 @@ def ttc_min(ego: str = "ego", other: str = "co", margin: float = 0.0, passed: fl
     had passed it before, and 10 if the gap does not shrink or the time is longer.
     """
     return Metric(
-        "ttc_min", lambda trace: _ttc_min(trace, ego, other, margin, passed), "s", "low", HORIZON,
+        "ttc_min", lambda trace: _smallest(ttc, trace, ego, other, margin, passed), "s", "low", HORIZON,
         "smallest time to collision at constant speeds, along the ego's heading",
         "Hayward (1972), Near-miss determination through use of a scale of danger",
     )  # fmt: skip
 
 
-def _d_min(trace: Trace, ego: str, other: str, margin: float, passed: float) -> float:
+def gap(trace: Trace, ego: str, other: str, margin: float) -> Vector:
+    """Return the (t,) gap while the other is in the ego's path (m)."""
     e = encounter(trace, ego, other, margin)
-    shared = e.ahead | e.beside
-    if not shared.any():
-        return passed if e.overtaken else FAR
-    gap = np.where(np.arange(len(e.gap)) == e.contact, 0.0, e.gap) if e.rear_end else e.gap
-    return float(min(gap[shared].min(), FAR))
+    return e.after_contact(np.where(e.ahead | e.beside, np.minimum(e.gap, FAR), FAR), 0.0)
 
 
 def d_min(ego: str = "ego", other: str = "co", margin: float = 0.0, passed: float = OVERTAKEN) -> Metric:
@@ -176,22 +180,21 @@ def d_min(ego: str = "ego", other: str = "co", margin: float = 0.0, passed: floa
     entered the path, and 1,000 without a shared path.
     """
     return Metric(
-        "d_min", lambda trace: _d_min(trace, ego, other, margin, passed), "m", "low", FAR,
+        "d_min", lambda trace: _smallest(gap, trace, ego, other, margin, passed), "m", "low", FAR,
         "smallest gap along the ego's heading while the other is in its path",
     )  # fmt: skip
 
 
-def _thw_min(trace: Trace, ego: str, other: str, margin: float) -> float:
+def thw(trace: Trace, ego: str, other: str, margin: float) -> Vector:
+    """Return the (t,) time headway (s)."""
     e = encounter(trace, ego, other, margin)
-    if not e.ahead.any():
-        return HORIZON
-    return float(np.minimum(e.gap / np.maximum(e.speed, 1e-3), HORIZON)[e.ahead].min())
+    return e.after_contact(np.where(e.ahead, np.minimum(e.gap / np.maximum(e.speed, 1e-3), HORIZON), HORIZON), 0.0)
 
 
 def thw_min(ego: str = "ego", other: str = "co", margin: float = 0.0) -> Metric:
-    """Return the smallest time headway behind the other (s), at most 10."""
+    """Return the smallest time headway behind the other (s), at most 10, 0 for a rear-end collision."""
     return Metric(
-        "thw_min", lambda trace: _thw_min(trace, ego, other, margin), "s", "low", HORIZON,
+        "thw_min", lambda trace: float(thw(trace, ego, other, margin).min()), "s", "low", HORIZON,
         "smallest gap divided by the ego's speed, while the other is ahead in its path",
     )  # fmt: skip
 

@@ -34,31 +34,13 @@ import numpy as np
 from sbt.errors import InputError
 from sbt.metrics.braking import btn, drac, mdrac, mttc
 from sbt.metrics.comfort import jerk
-from sbt.metrics.longitudinal import FAR, HORIZON, encounter, time_to_collision
+from sbt.metrics.longitudinal import Signal, encounter, gap, thw, ttc
 from sbt.metrics.planar import distance, ttc_2d
 from sbt.metrics.rss import lateral_margin, longitudinal_margin
 from sbt.problem.arrays import Vector
 from sbt.problem.trace import ActorTrace, Trace
 
 __all__ = ["ACTOR_SIGNALS", "PAIR_SIGNALS", "check_signal", "signal"]
-
-
-def gap(trace: Trace, ego: str, other: str, margin: float) -> Vector:
-    """Return the (t,) gap while the other is in the ego's path (m)."""
-    e = encounter(trace, ego, other, margin)
-    return e.after_contact(np.where(e.ahead | e.beside, np.minimum(e.gap, FAR), FAR), 0.0)
-
-
-def ttc(trace: Trace, ego: str, other: str, margin: float) -> Vector:
-    """Return the (t,) time to collision along the ego's heading (s)."""
-    e = encounter(trace, ego, other, margin)
-    return e.after_contact(np.where(e.ahead | e.beside, time_to_collision(e), HORIZON), 0.0)
-
-
-def thw(trace: Trace, ego: str, other: str, margin: float) -> Vector:
-    """Return the (t,) time headway (s)."""
-    e = encounter(trace, ego, other, margin)
-    return e.after_contact(np.where(e.ahead, np.minimum(e.gap / np.maximum(e.speed, 1e-3), HORIZON), HORIZON), 0.0)
 
 
 def closing(trace: Trace, ego: str, other: str, margin: float) -> Vector:
@@ -72,7 +54,7 @@ def lateral(trace: Trace, ego: str, other: str, margin: float) -> Vector:
     return np.cos(a.heading) * (b.y - a.y) - np.sin(a.heading) * (b.x - a.x)
 
 
-PAIR_SIGNALS: dict[str, Callable[[Trace, str, str, float], Vector]] = {
+PAIR_SIGNALS: dict[str, Signal] = {
     "gap": gap, "ttc": ttc, "thw": thw, "mttc": mttc, "drac": drac, "mdrac": mdrac, "btn": btn, "ttc2d": ttc_2d,
     "distance": distance, "closing": closing, "lateral": lateral,
     "rss_longitudinal": longitudinal_margin, "rss_lateral": lateral_margin,

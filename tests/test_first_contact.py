@@ -1,0 +1,39 @@
+"""Metrics of two road users at their first contact: at it, between two instants or not, and after it, in records that go on."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sbt.metrics.braking import btn_max, drac, mttc_min
+from sbt.metrics.longitudinal import d_min, drac_max, impact_speed, thw_min, ttc_min
+from sbt.metrics.signals import signal
+from sbt.problem.trace import Trace
+
+CAR, PERSON = (5.0, 1.8), (0.215, 0.478)
+STEPS = (0.05, 0.1, 0.2, 0.5, 1.0)
+
+
+def rear_end(step: float, size: tuple[float, float] = CAR, speed: float = 20.0, until: float = 6.0) -> Trace:
+    """Ego drives through one who stands, whom it reaches after 3.1 s."""
+    time = np.arange(0.0, until + 1e-9, step)
+    zero = np.zeros_like(time)
+    x = np.column_stack([speed * time, zero + 3.1 * speed + 0.5 * (CAR[0] + size[0])])
+    still = np.column_stack([zero, zero])
+    length, width = np.array([CAR, size]).T
+    return Trace(time, ("ego", "co"), x, still, still, np.column_stack([zero + speed, zero]), still, length, width)
+
+
+@pytest.mark.parametrize("size", [CAR, PERSON])
+@pytest.mark.parametrize("speed", [20.0, 30.0])
+@pytest.mark.parametrize("step", STEPS)
+def test_a_rear_end_collision_has_no_time_and_no_gap_left_however_far_the_step_goes(step, speed, size):
+    """Where the ego was past the other at the next instant, the smallest TTC was .1 s and the smallest gap 2 m."""
+    trace = rear_end(step, size, speed)
+    assert impact_speed()(trace) == speed
+    metrics = {"ttc": ttc_min(), "gap": d_min(), "thw": thw_min(), "mttc": mttc_min()}
+    assert {name: metric(trace) for name, metric in metrics.items()} == dict.fromkeys(metrics, 0.0)
+    for name, metric in metrics.items():
+        assert metric(trace) == signal(trace, name).min()
+    assert drac_max()(trace) == drac(trace, "ego", "co", 0.0).max() == 100.0
+    assert btn_max()(trace) == 12.5
