@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from sbt.metrics.braking import btn_max, drac, mttc_min
-from sbt.metrics.longitudinal import d_min, drac_max, impact_speed, thw_min, ttc_min
+from sbt.metrics.longitudinal import d_min, drac_max, first_contact, impact_speed, thw_min, ttc_min
+from sbt.metrics.rss import rss_lateral_min, rss_longitudinal_min
 from sbt.metrics.signals import signal
 from sbt.problem.trace import Trace
 
@@ -37,3 +38,18 @@ def test_a_rear_end_collision_has_no_time_and_no_gap_left_however_far_the_step_g
         assert metric(trace) == signal(trace, name).min()
     assert drac_max()(trace) == drac(trace, "ego", "co", 0.0).max() == 100.0
     assert btn_max()(trace) == 12.5
+
+
+@pytest.mark.parametrize("step", STEPS)
+@pytest.mark.parametrize("size", [CAR, PERSON])
+def test_the_margins_of_rss_end_at_the_contact(step, size):
+    """Those of an ego that was beside the other only after it had driven through it were those of passing it."""
+    whole = rear_end(step, size)
+    k = first_contact(whole, "ego", "co")
+    ended = whole.select(slice(0, k + 1))
+    for metric in (rss_longitudinal_min(), rss_lateral_min()):
+        assert metric(whole) == metric(ended), metric.name
+    for name in ("rss_longitudinal", "rss_lateral"):
+        values = signal(whole, name)
+        assert values[: k + 1].tolist() == signal(ended, name).tolist()
+        assert (values[k:] == values[k]).all()

@@ -18,8 +18,8 @@ import numpy as np
 from sbt.errors import InputError
 from sbt.metrics.arcs import while_passing
 from sbt.metrics.exposure import integral
-from sbt.metrics.geometry import part_pairs
-from sbt.metrics.longitudinal import FAR
+from sbt.metrics.geometry import part_pairs, select_instants
+from sbt.metrics.longitudinal import FAR, first_contact
 from sbt.metrics.strips import turned_in_behind
 from sbt.problem.arrays import Mask, Vector
 from sbt.problem.metric import Metric
@@ -142,15 +142,30 @@ def _behind(trace: Trace, ego: str, other: str, aside: Vector | float) -> Mask:
     return found
 
 
+def _until_contact(trace: Trace, ego: str, other: str) -> slice:
+    """Return the instants until the first contact of the two, all without one."""
+    k = first_contact(trace, ego, other)
+    return slice(None if k is None else k + 1)
+
+
+def _held(trace: Trace, ego: str, other: str, values: Vector) -> Vector:
+    """Return the (t,) values; from the first contact of the two on that at it."""
+    k = first_contact(trace, ego, other)
+    return values if k is None else np.where(np.arange(len(values)) > k, values[k], values)
+
+
 def longitudinal_margin(trace: Trace, ego: str, other: str, margin: float = 0.0, rules: Rss = DEFAULT) -> Vector:
-    """Return the (t,) longitudinal distance minus the safe one (m), at any lateral position; 1,000 where the ego has no duty."""
+    """Return the (t,) longitudinal distance minus the safe one (m), at any lateral position; 1,000 where the ego has no duty.
+
+    From the first contact on it stays.
+    """
     r, own = _relation(trace.actor(ego), trace.actor(other)), trace.actor(ego).speed
     cos = np.cos(r.turn)
     along = np.abs(trace.actor(other).speed * cos)
     same = rules.same_direction(np.where(r.ahead, own, along), np.where(r.ahead, along, own))
     safe = np.where(cos > 0, same, rules.opposite_direction(own, along))
     assessed = (np.abs(cos) >= _MIN_COS) & (r.ahead | (r.gap < 0))
-    return np.where(assessed, np.minimum(r.gap - safe, FAR), FAR)
+    return _held(trace, ego, other, np.where(assessed, np.minimum(r.gap - safe, FAR), FAR))
 
 
 def _safe_aside(r: _Relation, other: ActorTrace, rules: Rss) -> Vector:
@@ -159,8 +174,12 @@ def _safe_aside(r: _Relation, other: ActorTrace, rules: Rss) -> Vector:
 
 
 def lateral_margin(trace: Trace, ego: str, other: str, margin: float = 0.0, rules: Rss = DEFAULT) -> Vector:
-    """Return the (t,) lateral distance minus the safe one (m), at any longitudinal position; at most 1,000."""
-    return _margin_aside(_relation(trace.actor(ego), trace.actor(other)), trace.actor(other), rules)
+    """Return the (t,) lateral distance minus the safe one (m), at any longitudinal position; at most 1,000.
+
+    From the first contact on it stays.
+    """
+    a, b = trace.actor(ego), trace.actor(other)
+    return _held(trace, ego, other, _margin_aside(_relation(a, b), b, rules))
 
 
 def _margin_aside(r: _Relation, other: ActorTrace, rules: Rss) -> Vector:
@@ -173,8 +192,8 @@ def rss_longitudinal_min(ego: str = "ego", other: str = "co", margin: float = 0.
 
     def function(trace: Trace) -> float:
         r = _relation(trace.actor(ego), trace.actor(other))
-        in_path = (r.clearance < margin) & ~_behind(trace, ego, other, margin)
-        return float(longitudinal_margin(trace, ego, other, rules=rules)[in_path].min(initial=FAR))
+        in_path, counted = (r.clearance < margin) & ~_behind(trace, ego, other, margin), _until_contact(trace, ego, other)
+        return float(longitudinal_margin(trace, ego, other, rules=rules)[counted][in_path[counted]].min(initial=FAR))
 
     return Metric(
         "rss_longitudinal_min", function, "m", "low", FAR,
@@ -186,7 +205,7 @@ def rss_lateral_min(ego: str = "ego", other: str = "co", rules: Rss = DEFAULT) -
     """Return the smallest lateral distance minus the safe one while the two are level (m), at instants or between them."""
 
     def function(trace: Trace) -> float:
-        own, co = trace.actor(ego), trace.actor(other)
+        own, co = (select_instants(trace.actor(name), _until_contact(trace, ego, other)) for name in (ego, other))
         r, way = _relation(own, co), np.hypot(np.diff(co.x - own.x), np.diff(co.y - own.y))
         between = while_passing(own, co, r.gap[1:] + r.gap[:-1] < way)
         within = _relation(*between)

@@ -1,7 +1,7 @@
 """Named signals of a trace: quantities at every instant, (t,) finite numbers.
 
 Scalar metrics are their worst values, and formulas of `sbt.metrics.stl` refer to them. Without an interaction
-a signal has a fixed value; from a rear-end collision on it keeps the value at that collision.
+a signal has a fixed value; from a rear-end collision on it keeps the value at that collision, those of RSS from any contact on.
 
 Of the ego and the other road user:
 
