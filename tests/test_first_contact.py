@@ -9,6 +9,7 @@ from sbt.metrics.braking import btn_max, drac, mttc_min
 from sbt.metrics.longitudinal import d_min, drac_max, first_contact, impact_speed, thw_min, ttc_min
 from sbt.metrics.rss import rss_lateral_min, rss_longitudinal_min
 from sbt.metrics.signals import signal
+from sbt.metrics.traffic import others_braking_max
 from sbt.problem.trace import Trace
 
 CAR, PERSON = (5.0, 1.8), (0.215, 0.478)
@@ -53,3 +54,18 @@ def test_the_margins_of_rss_end_at_the_contact(step, size):
         values = signal(whole, name)
         assert values[: k + 1].tolist() == signal(ended, name).tolist()
         assert (values[k:] == values[k]).all()
+
+
+def test_braking_of_who_was_hit_is_none_that_the_ego_relies_on():
+    whole = rear_end(0.1, speed=20.0)
+    k = first_contact(whole, "ego", "co")
+    time, late = whole.time, np.arange(len(whole.time))
+    for start, found in ((k - 3, 9.0), (k, 9.0), (k + 1, 2.0)):
+        hit = np.where(late >= start, -9.0, 0.0)
+        third = np.column_stack([np.zeros_like(hit), hit, np.where(late == len(late) - 1, -2.0, 0.0)])
+        x = np.column_stack([whole.x, whole.x[:, 0]])
+        y = np.column_stack([whole.y, whole.y[:, 0] + 9.0])
+        heading = np.zeros_like(x)
+        trace = Trace(time, ("ego", "co", "other"), x, y, heading, heading, third, np.full(3, 5.0), np.full(3, 1.8))
+        assert others_braking_max()(trace) == found
+        assert trace.acceleration.min() == -9.0

@@ -70,13 +70,18 @@ def any_impact_speed(ego: str = "ego") -> Metric:
 
 
 def others_braking_max(ego: str = "ego") -> Metric:
-    """Return the strongest deceleration of any other vehicle (m/s^2, positive), 0 without braking; persons halt in one step."""
+    """Return the strongest deceleration of any other vehicle (m/s^2, positive), 0 without braking; persons halt in one step.
+
+    Of one who touched the ego only what was before.
+    """
 
     def function(trace: Trace) -> float:
         walking = persons(trace)
         others = [k for k, name in enumerate(trace.actors) if name != ego and not walking[k]]
-        braking = -trace.acceleration[:, others]
-        return float(np.nanmax(braking, initial=0.0)) + 0.0  # no -0
+        braking = -trace.acceleration
+        for name, k in first_contacts(trace, ego).items():
+            braking[k + 1 :, trace.actors.index(name)] = 0.0
+        return float(np.nanmax(braking[:, others], initial=0.0)) + 0.0  # no -0
 
     return Metric(
         "others_braking_max", function, "m/s^2", "high", 0.0, "hardest braking of other vehicles: how much ego relies on them"
