@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from sbt.metrics.conflict_types import conflict, conflict_type, describe_conflict_type, from_behind
 from sbt.metrics.geometry import contact_index
+from sbt.metrics.longitudinal import COLLISION
 from sbt.metrics.pairwise import in_traffic
 from sbt.metrics.planar import TTC_2D_MIN
 from sbt.metrics.preventability import applicability, why_not
@@ -148,6 +149,17 @@ def test_who_has_been_passed_through_when_a_contact_ends_the_record_was_ahead():
     person = [(8.0, -0.5, np.pi / 2), (8.0, 0.9, np.pi / 2)]
     trace = met([(0.0, 0.0, 0.0), (15.0, 0.0, 0.0)], person, speeds=(15.0, 1.4), sizes=((5.0, 1.8), (0.3, 0.5)), step=1.0)
     assert told(trace) == "ahead of ego, crossing from the right"
+
+
+@pytest.mark.parametrize("decisive", [(), [(COLLISION, CriticalInterval(low=0.5))], [(TTC_2D_MIN, CriticalInterval(high=1.0))]])
+@pytest.mark.parametrize("last", [30, 45, 60, 90, 150])
+def test_the_side_of_a_contact_between_two_instants_does_not_depend_on_whether_the_record_goes_on(last, decisive):
+    """Who was driven through within a step was nearest, and behind, at the next instant: the ego drove away from it."""
+    rear_end = met([(d, 0.0, 0.0) for d in range(0, last + 1, 15)], [(24.0, 0.0, 0.0)] * (last // 15 + 1), speeds=(30.0, 0.0))
+    found = conflict(rear_end, "ego", decisive)
+    assert found is not None
+    assert found[3] == 2
+    assert describe_conflict_type(conflict_type("ego", decisive)(rear_end)) == "ahead of ego, same direction"
 
 
 def test_a_part_that_a_step_drives_the_ego_into_deeply_is_told_by_what_it_reached_first():

@@ -15,6 +15,7 @@ import numpy as np
 
 from sbt.metrics.geometry import (
     Rectangles,
+    contact_index,
     first_touch,
     overlap_depth,
     part_pairs,
@@ -159,9 +160,14 @@ def _value(metric: Metric, two: Trace) -> float:
 
 
 def _nearest(ego: ActorTrace, other: ActorTrace, instant: int | None) -> tuple[float, int]:
-    """Return the smallest distance of the rectangles (m, inf if they are not present together) and its instant."""
-    distance = rectangle_distance(ego, other)
+    """Return the smallest distance of the rectangles (m, inf if they are not present together) and its instant.
+
+    0 at that of the first contact, which may lie within the step before it.
+    """
+    distance, contact = rectangle_distance(ego, other), contact_index(ego, other)
     distance = np.where(np.isfinite(distance), distance, np.inf)
+    if contact is not None:
+        distance[contact] = 0.0
     k = int(distance.argmin()) if instant is None else instant
     return float(distance[k]), k
 
@@ -180,12 +186,12 @@ def from_behind(ego: ActorTrace, other: ActorTrace) -> bool:
 def side_and_course(ego: ActorTrace, other: ActorTrace, k: int) -> tuple[int, int]:
     """Return side and course (see `conflict_type`) of another rectangle at an instant; of a contact, as they begin to touch.
 
-    A step may drive them a car's width and more into each other, or past each other where a contact ends the record.
+    A step may drive them a car's width and more into each other, or past each other.
     """
     k %= len(ego.x)
     apart = np.flatnonzero(~(overlap_depth(ego, other)[: k + 1] > 0.0))
     begun = int(apart[-1]) + 1 if apart.size else 0
-    touch = first_touch(ego, other, min(begun, k)) if begun <= k or k == len(ego.x) - 1 else None
+    touch = first_touch(ego, other, min(begun, k))
     return _side_and_course(*((rectangle_at(ego, k), rectangle_at(other, k)) if touch is None else touch[1:]))
 
 
