@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from sbt import plugins
 from sbt.errors import InputError
 from sbt.metrics.braking import btn, btn_max, drac, mdrac, mdrac_max, mttc_min
-from sbt.metrics.comfort import deceleration_max, jerk_max
+from sbt.metrics.comfort import deceleration_max, jerk, jerk_max
 from sbt.metrics.exposure import tet, tit
 from sbt.metrics.geometry import corners, time_to_contact
 from sbt.metrics.longitudinal import HORIZON, drac_max, impact_speed, ttc_min
@@ -262,6 +262,25 @@ def test_course_against_a_circle():
     assert (beyond[0][0], beyond[1][0]) == (2.0, math.pi)
     with pytest.raises(ValueError, match="at least two points"):
         deviation(trace.actor("ego"), np.zeros((2, 2)))
+
+
+def test_metrics_of_an_ego_that_is_absent_for_a_moment_are_those_of_when_it_is_there():
+    """Its braking of 6 m/s^2 was 0, and its jerk and its offset were NaN."""
+    time = np.arange(0.0, 5.01, 0.1)
+    braking = np.where(time > 2.05, -6.0, np.where(time > 1.05, -2.0, 0.0))
+    gone = (time > 3.02) & (time < 3.48)
+    a = np.where(gone, np.nan, np.where(time > 3.48, -1.0, braking))
+    there = np.where(gone, np.nan, 0.0)
+    x, y = np.where(gone, np.nan, 20.0 * time), there + 0.3
+    trace = Trace(time, ("ego",), *(v[:, None] for v in (x, y, there + 0.1, there + 20.0, a)), np.array([5.0]), np.array([1.8]))
+    assert deceleration_max()(trace) == 6.0
+    assert jerk_max()(trace) == pytest.approx(40.0)
+    assert lateral_error_max([(0.0, 0.0), (1.0, 0.0)])(trace) == pytest.approx(0.3)
+    assert heading_error_max([(0.0, 0.0), (1.0, 0.0)])(trace) == pytest.approx(0.1)
+    rate = jerk(trace.actor("ego"), time)
+    assert (np.isnan(rate) == gone).all()
+    after = np.flatnonzero(time > 3.48)
+    assert (rate[after] == 0.0).all(), "across the absence nothing is measured"
 
 
 def test_curve_projects_back_what_is_beside_it():

@@ -12,12 +12,14 @@ __all__ = ["deceleration_max", "jerk", "jerk_max"]
 
 
 def jerk(actor: ActorTrace, time: Vector) -> Vector:
-    """Return the (t,) rate of change of the acceleration over the step before each instant (m/s^3).
+    """Return the (t,) rate of change of the acceleration over the step before each instant (m/s^3), NaN while it is absent.
 
-    0 at the first two instants, because the first acceleration of a trace is not measured.
+    0 at its first two instants, and at the first two after an absence, because the first acceleration is not measured.
     """
-    result = np.zeros(len(time))
-    result[2:] = np.diff(actor.acceleration[1:]) / np.diff(time[1:])
+    a = actor.acceleration
+    result = np.where(np.isnan(a), np.nan, 0.0)
+    known = np.isfinite(a[2:]) & np.isfinite(a[1:-1]) & np.isfinite(a[:-2])
+    result[2:][known] = (np.diff(a[1:]) / np.diff(time[1:]))[known]
     return result
 
 
@@ -25,7 +27,7 @@ def jerk_max(ego: str = "ego") -> Metric:
     """Return the largest absolute jerk along the heading (m/s^3), by differences over the steps of the trace."""
 
     def function(trace: Trace) -> float:
-        return float(np.abs(jerk(trace.actor(ego), trace.time)).max())
+        return float(np.nanmax(np.abs(jerk(trace.actor(ego), trace.time)), initial=0.0))
 
     return Metric("jerk_max", function, "m/s^3", "high", 0.0, "largest absolute rate of the ego's acceleration", alone=True)
 
@@ -34,7 +36,7 @@ def deceleration_max(ego: str = "ego") -> Metric:
     """Return the strongest deceleration (m/s^2), 0 if the ego never brakes."""
 
     def function(trace: Trace) -> float:
-        return float(max(0.0, -trace.actor(ego).acceleration.min()))
+        return float(np.nanmax(-trace.actor(ego).acceleration, initial=0.0)) + 0.0  # no -0
 
     return Metric("deceleration_max", function, "m/s^2", "high", 0.0, "strongest deceleration of the ego", alone=True)
 

@@ -161,9 +161,11 @@ def deviation(actor: ActorTrace, line: Points) -> tuple[Vector, Vector]:
 def _largest(name: str, error: int, unit: str, description: str, line: ArrayLike, ego: str) -> Metric:
     """Return the largest absolute offset (error 0) or relative heading (error 1) from a polyline as a metric."""
     points = as_points(line, 2)
-    return Metric(
-        name, lambda trace: float(np.abs(deviation(trace.actor(ego), points)[error]).max()), unit, "high", 0.0, description
-    )
+
+    def function(trace: Trace) -> float:
+        return float(np.nanmax(np.abs(deviation(trace.actor(ego), points)[error]), initial=0.0))
+
+    return Metric(name, function, unit, "high", 0.0, description)
 
 
 def lateral_error_max(line: ArrayLike, ego: str = "ego") -> Metric:
