@@ -264,6 +264,17 @@ def test_course_against_a_circle():
         deviation(trace.actor("ego"), np.zeros((2, 2)))
 
 
+@pytest.mark.parametrize("known", [lambda k: (k <= 20) | (k >= 30), lambda k: k % 5 != 3, lambda k: (k <= 25) | (k % 5 == 0)])
+def test_the_jerk_at_uneven_steps_is_that_between_the_middles_of_the_steps(known):
+    """Accelerations are differences of speeds: a constant jerk of 2 m/s^3 was one of 11 after a hole of .9 s."""
+    k = np.flatnonzero(known(np.arange(51)))
+    time = 0.1 * k
+    speed = time**2
+    acceleration = np.concatenate([[0.0], np.diff(speed) / np.diff(time)])
+    ego = ActorTrace(time**3 / 3.0, 0.0 * time, 0.0 * time, speed, acceleration, 5.0, 1.8)
+    np.testing.assert_allclose(jerk(ego, time), [0.0, 0.0, *np.full(len(k) - 2, 2.0)], rtol=1e-9)
+
+
 def test_metrics_of_an_ego_that_is_absent_for_a_moment_are_those_of_when_it_is_there():
     """Its braking of 6 m/s^2 was 0, and its jerk and its offset were NaN."""
     time = np.arange(0.0, 5.01, 0.1)

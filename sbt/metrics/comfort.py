@@ -15,11 +15,14 @@ def jerk(actor: ActorTrace, time: Vector) -> Vector:
     """Return the (t,) rate of change of the acceleration over the step before each instant (m/s^3), NaN while it is absent.
 
     0 at its first two instants, and at the first two after an absence, because the first acceleration is not measured.
+    Accelerations are means over the steps before their instants, as differences of speeds are.
     """
-    a = actor.acceleration
+    a, step = actor.acceleration, np.diff(time)
     result = np.where(np.isnan(a), np.nan, 0.0)
     known = np.isfinite(a[2:]) & np.isfinite(a[1:-1]) & np.isfinite(a[:-2])
-    result[2:][known] = (np.diff(a[1:]) / np.diff(time[1:]))[known]
+    mean = 0.5 * (step[1:] + step[:-1])
+    apart = np.where(np.isclose(step[1:], step[:-1]), step[1:], mean)  # the middles of the two steps (s)
+    result[2:][known] = (np.diff(a[1:]) / apart)[known]
     return result
 
 
