@@ -118,6 +118,21 @@ def test_a_gap_or_a_jump_begins_a_new_interval(tmp_path):
     assert near_pairs(recording, 19.0) == []
 
 
+def test_no_acceleration_is_taken_across_a_gap_or_a_jump(tmp_path):
+    """Who was teleported from 20 m/s to a standstill had braked with 200 m/s^2, who stood after a gap with 2."""
+    times = np.round(np.arange(0.0, 12.0, 0.1), 1)
+    rows = [row(t, "teleported", *((20.0 * t, 0.0) if t < 4 else (110.0, 0.0)), speed=20.0 * (t < 4)) for t in times]
+    rows += [row(t, "seen", 20.0 * min(t, 2.0), 9.0, speed=20.0 * (t < 2)) for t in times if t < 2 or t > 10.05]
+    rows += [row(t, "brakes", 60.0, -9.0, speed=round(20.0 - t, 1)) for t in times if t < 5 or t > 10.05]
+    recording = read_fcd(written(tmp_path, "a.csv", as_csv(rows)))
+    assert recording.names == ("brakes", "seen", "teleported")
+    there, first, last = (recording.acceleration[slice(*recording.start[k : k + 2])] for k in range(3))
+    firsts = [0, int((times < 5).sum())]
+    np.testing.assert_allclose(there, [0.0 if k in firsts else -1.0 for k in range(len(there))])
+    assert not first.any()
+    assert not last.any()
+
+
 @pytest.mark.parametrize(
     ("name", "text", "words"),
     [

@@ -4,9 +4,9 @@ Reads XML, CSV (separated by `,` or `;`), both also gzipped, and Parquet, with S
 (`timestep_time`, `vehicle_x`, `person_x`, ...) or plain ones (`time`, `id`, `x`, `y`, `angle`, `speed`). SUMO's
 positions are those of the front bumper, and its angles are degrees clockwise from north; both are converted here.
 Sizes and accelerations are read where the file has them (`length`, `width`, `acceleration`); otherwise sizes are
-arguments of the reader, and accelerations are finite differences of the speeds. Heights (`z`, and `slope` in degrees) tell who
-is on a bridge and who is below; without them all is one level. SUMO writes two decimal places by default; `--precision 6` is
-recommended.
+arguments of the reader, and accelerations are finite differences of the speeds, 0 where a track begins. Heights (`z`,
+and `slope` in degrees) tell who is on a bridge and who is below; without them all is one level. SUMO writes two decimal
+places by default; `--precision 6` is recommended.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from sbt.metrics import heights
 from sbt.metrics.geometry import farthest
 from sbt.metrics.pairwise import without_overtaking
 from sbt.plugins import load, names
-from sbt.problem.arrays import Vector
+from sbt.problem.arrays import Mask, Vector
 from sbt.problem.metric import Metric
 from sbt.problem.trace import Trace
 
@@ -162,14 +162,15 @@ def recording_of_columns(path: Path, ids: Any, kinds: Any, columns: dict[str, An
     assumed = int((np.isnan(data["length"] + data["width"])[start[:-1]] & ~person).sum())
     heading = np.radians(90.0 - data["angle"])
     half = 0.5 * lengths[user]
-    acceleration = _differences(data["speed"], time[step], start)
+    x, y = data["x"] - half * np.cos(heading), data["y"] - half * np.sin(heading)
+    goes_on = (np.diff(user) == 0) & ~_interrupted(np.diff(step), np.diff(time[step]), np.hypot(np.diff(x), np.diff(y)))
+    acceleration = _differences(data["speed"], time[step], goes_on)
     acceleration = np.where(np.isnan(data["acceleration"]), acceleration, data["acceleration"])
     z, slope = (data.get(name, np.full(len(order), np.nan)) for name in ("z", "slope"))
     flat = bool(np.isnan(z).all())
     rise = np.tan(np.radians(np.nan_to_num(slope)))
     return Recording(
-        tuple(users.tolist()), time, start, step.astype(np.int64), data["x"] - half * np.cos(heading),
-        data["y"] - half * np.sin(heading), heading, data["speed"], acceleration, lengths, widths,
+        tuple(users.tolist()), time, start, step.astype(np.int64), x, y, heading, data["speed"], acceleration, lengths, widths,
         tuple(np.array(_KINDS)[person.astype(int)].tolist()),
         None if flat else z, None if flat else rise, assumed,
     )  # fmt: skip
@@ -187,12 +188,15 @@ def _check_metres(path: Path, data: dict[str, Vector], user: Integers) -> None:
         )
 
 
-def _differences(speed: Vector, time: Vector, start: Integers) -> Vector:
-    """Return the (n,) rate of change of the speed since the previous row, 0 in the first row of a road user."""
+def _interrupted(steps: Integers, elapsed: Vector, moved: Vector) -> Mask:
+    """Return where time steps of the file lie between two rows, or where somebody was teleported."""
+    return (steps > 1) | (moved > farthest(elapsed))
+
+
+def _differences(speed: Vector, time: Vector, goes_on: Mask) -> Vector:
+    """Return the (n,) rate of change of the speed since the previous row, 0 where the row does not go on from it."""
     rate = np.zeros(len(speed))
-    elapsed = np.diff(time)
-    rate[1:] = np.diff(speed) / np.where(elapsed > 0, elapsed, np.inf)
-    rate[start[:-1]] = 0.0
+    rate[1:][goes_on] = np.diff(speed)[goes_on] / np.diff(time)[goes_on]
     return rate
 
 
@@ -328,7 +332,7 @@ def pair_traces(recording: Recording, ego: int, other: int) -> Iterator[Trace]:
         return
     time = recording.time[steps]
     moved = np.hypot(np.diff(recording.x[rows], axis=0), np.diff(recording.y[rows], axis=0)).max(axis=1)
-    cut = (np.diff(steps) > 1) | (moved > farthest(np.diff(time)))
+    cut = _interrupted(np.diff(steps), np.diff(time), moved)
     who = [ego, other]
     for part in np.split(np.arange(len(steps)), np.flatnonzero(cut) + 1):
         if len(part) > 1:
