@@ -39,6 +39,8 @@ __all__ = ["PERSON_SIZE", "Recording", "catalogue", "encounters", "near_pairs", 
 
 PERSON_SIZE = (0.215, 0.478)
 """Length and width of a person whose size is not in the file (m): SUMO's default pedestrian."""
+_ABLE, _INEXACT, _RARE = 10.0, 1.0, 0.1
+"""Who is farther ahead than by such an acceleration (m/s^2), and this far (m), was teleported: in at most this share of steps."""
 _COLUMNS = ("time", "x", "y", "angle", "speed", "acceleration", "length", "width", "z", "slope")
 _REQUIRED = ("time", "id", "x", "y", "angle", "speed")
 _KINDS = ("vehicle", "person")
@@ -62,6 +64,7 @@ class Recording:
         acceleration: (n,) along the heading (m/s^2).
         length: (m,) of the rectangles (m).
         width: (m,) of the rectangles (m).
+        goes_on: (n - 1,) whether a road user has driven from a row to the next one.
     """
 
     names: tuple[str, ...]
@@ -75,6 +78,7 @@ class Recording:
     acceleration: Vector
     length: Vector
     width: Vector
+    goes_on: Mask
     kinds: tuple[str, ...] = ()
     """m texts, such as vehicle, person, truck or bicycle."""
     z: Vector | None = None
@@ -163,7 +167,7 @@ def recording_of_columns(path: Path, ids: Any, kinds: Any, columns: dict[str, An
     heading = np.radians(90.0 - data["angle"])
     half = 0.5 * lengths[user]
     x, y = data["x"] - half * np.cos(heading), data["y"] - half * np.sin(heading)
-    goes_on = (np.diff(user) == 0) & ~_interrupted(np.diff(step), np.diff(time[step]), np.hypot(np.diff(x), np.diff(y)))
+    goes_on = _goes_on(user, step, time[step], (x, y, heading, data["speed"]))
     acceleration = _differences(data["speed"], time[step], goes_on)
     acceleration = np.where(np.isnan(data["acceleration"]), acceleration, data["acceleration"])
     z, slope = (data.get(name, np.full(len(order), np.nan)) for name in ("z", "slope"))
@@ -171,7 +175,7 @@ def recording_of_columns(path: Path, ids: Any, kinds: Any, columns: dict[str, An
     rise = np.tan(np.radians(np.nan_to_num(slope)))
     return Recording(
         tuple(users.tolist()), time, start, step.astype(np.int64), x, y, heading, data["speed"], acceleration, lengths, widths,
-        tuple(np.array(_KINDS)[person.astype(int)].tolist()),
+        goes_on, tuple(np.array(_KINDS)[person.astype(int)].tolist()),
         None if flat else z, None if flat else rise, assumed,
     )  # fmt: skip
 
@@ -188,9 +192,25 @@ def _check_metres(path: Path, data: dict[str, Vector], user: Integers) -> None:
         )
 
 
-def _interrupted(steps: Integers, elapsed: Vector, moved: Vector) -> Mask:
-    """Return where time steps of the file lie between two rows, or where somebody was teleported."""
-    return (steps > 1) | (moved > farthest(elapsed))
+def _goes_on(user: Integers, step: Integers, time: Vector, states: tuple[Vector, Vector, Vector, Vector]) -> Mask:
+    """Return (n - 1,) whether rows are followed by one of the same road user, at the next step, that it may have driven to.
+
+    Else it was away, or was teleported: farther ahead than by its speeds, if these are those of the positions elsewhere.
+
+    Args:
+        user: (n,) of each row, sorted.
+        step: (n,) of each row, sorted of each user.
+        time: (n,) s.
+        states: (n,) x, y (m), heading (rad) and speed (m/s).
+    """
+    x, y, heading, speed = states
+    elapsed, dx, dy = np.diff(time), np.diff(x), np.diff(y)
+    follows = (np.diff(user) == 0) & (np.diff(step) == 1)
+    driven = follows & (np.hypot(dx, dy) <= farthest(elapsed))
+    ahead = dx * np.cos(heading[:-1]) + dy * np.sin(heading[:-1])
+    able = np.minimum(np.maximum(speed[1:], speed[:-1]), speed[:-1] + _ABLE * elapsed)
+    explained = driven & (ahead <= able * elapsed + _INEXACT)
+    return explained if (driven & ~explained).sum() <= _RARE * driven.sum() else driven
 
 
 def _differences(speed: Vector, time: Vector, goes_on: Mask) -> Vector:
@@ -331,8 +351,7 @@ def pair_traces(recording: Recording, ego: int, other: int) -> Iterator[Trace]:
     if not len(steps):
         return
     time = recording.time[steps]
-    moved = np.hypot(np.diff(recording.x[rows], axis=0), np.diff(recording.y[rows], axis=0)).max(axis=1)
-    cut = _interrupted(np.diff(steps), np.diff(time), moved)
+    cut = (np.diff(steps) > 1) | ~recording.goes_on[rows[1:] - 1].all(axis=1)
     who = [ego, other]
     for part in np.split(np.arange(len(steps)), np.flatnonzero(cut) + 1):
         if len(part) > 1:
