@@ -16,10 +16,10 @@ from sbt.problem.plain import Values
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.space import ParameterSpace
-from sbt.sumo.actors import Action, Actor, Controller, Scene, State, VehicleType
+from sbt.sumo.actors import Action, Actor, Controller, Obstacle, Scene, State, VehicleType
 from sbt.sumo.ego import Ego
 from sbt.sumo.nets import net_file
-from sbt.sumo.resetting import why_fresh
+from sbt.sumo.resetting import changes_of, why_fresh
 from sbt.sumo.simulation import SumoSimulation
 from sbt.workflows.front import check_target
 from tests.own_networks import run_program
@@ -157,9 +157,32 @@ def insert() -> None:
     libsumo.vehicle.add("unasked", "r")
 
 
-@pytest.mark.parametrize("change", [limit, close, insert])
+def reroute() -> None:
+    libsumo.route.add("mine", ["ei", "no"])
+    libsumo.vehicle.setRouteID("co", "mine")
+
+
+def draw() -> None:
+    libsumo.polygon.add("drawn", [(0.0, 0.0), (1.0, 1.0), (1.0, 0.0)], (1, 1, 1, 1))
+    libsumo.poi.add("marked", 0.0, 0.0, (1, 1, 1, 1))
+
+
+@pytest.mark.parametrize("change", [limit, close, insert, reroute, draw])
 def test_a_run_that_changes_more_than_its_actors_is_the_last_of_its_simulation(net_of, change: Callable[[], None]):
     assert same_as_loaded(meeting(net_of("priority"), Calm(change)), "reuse")
+
+
+def test_what_this_package_adds_and_removes_is_no_change_of_the_runs_code(net_of):
+    """Routes, vehicles and polygons of a scene; those of the run's code, in any domain of SUMO, are."""
+    simulation = meeting(net_of("priority"), Calm())
+    wall = Obstacle("wall", (300.0, 50.0, 0.0), 1.0, 1.0)
+    walled = replace(simulation, scene=lambda *given: replace(simulation.scene(*given), obstacles=(wall,)), isolation="reuse")
+    changes = changes_of(libsumo)
+    for _ in range(2):
+        walled({"x": 0.0}, 0)
+        assert not changes
+    for domain in libsumo.DOMAINS:
+        assert hasattr(domain.add if domain in (libsumo.vehicle, libsumo.person) else domain.setParameter, "__wrapped__")
 
 
 def test_built_in_scenarios_are_kept():

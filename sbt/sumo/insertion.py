@@ -71,8 +71,9 @@ def insert(sumo: Any, scene: Scene, prefix: str = "") -> None:
                 limit_to_friction(sumo, name, scene.friction)
         if actor.pose is not None:
             pose_setter(sumo, actor, prefix)(actor.pose)
+    draw = unwrapped(sumo, "polygon", "add")
     for obstacle in scene.obstacles:
-        sumo.polygon.add(prefix + obstacle.name, list(obstacle.corners), _OBSTACLE_COLOR, True, "obstacle")
+        draw(prefix + obstacle.name, list(obstacle.corners), _OBSTACLE_COLOR, True, "obstacle")
         registry.inserted(prefix + obstacle.name, "polygon")
 
 

@@ -39,12 +39,9 @@ _DRAWING = {
 }  # fmt: skip
 """Attributes of vehicle types with which SUMO draws random numbers unless they are 0."""
 _ZERO = re.compile(r"\s*0*\.?0*\s*")
-_DOMAINS = (
-    "lane", "edge", "junction", "trafficlight", "vehicletype", "simulation", "calibrator", "rerouter", "variablespeedsign",
-    "parkingarea", "chargingstation", "busstop", "overheadwire", "inductionloop", "lanearea", "multientryexit", "meandata",
-    "routeprobe",
-)  # fmt: skip
 _CHANGES = re.compile("set|adapt|add|copy|swap|remove|update|override|load|clear")
+_INSERTS = re.compile("add(Full|Legacy)?$")
+"""Of vehicles and persons: what else is done to them ends with them."""
 
 
 def why_fresh(net: str, options: tuple[str, ...], actors: Iterable[Actor]) -> str:
@@ -112,16 +109,14 @@ def changes_of(sumo: Any) -> list[str]:
     """Return a list to which libsumo adds the name of every function by which code changes more than its own actors.
 
     Args:
-        sumo: the module; what this package calls to insert its actors adds nothing.
+        sumo: the module; what this package calls to insert and remove its own (`unwrapped`) adds nothing.
     """
     changes: list[str] = []
-    for domain in _DOMAINS:
-        functions = getattr(sumo, domain)
-        for name in [name for name in vars(functions) if _CHANGES.match(name)]:
-            setattr(functions, name, staticmethod(_noting(getattr(functions, name), f"{domain}.{name}", changes)))
-    for domain in ("vehicle", "person"):
-        functions = getattr(sumo, domain)
-        functions.add = staticmethod(_noting(functions.add, f"{domain}.add", changes))
+    for functions in sumo.DOMAINS:
+        changing = _INSERTS if functions in (sumo.vehicle, sumo.person) else _CHANGES
+        for name in filter(changing.match, list(vars(functions))):
+            noting = _noting(getattr(functions, name), f"{functions.__name__}.{name}", changes)
+            setattr(functions, name, staticmethod(noting))
     return changes
 
 

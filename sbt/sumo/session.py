@@ -259,7 +259,7 @@ class Session:
         """Return the id of the route over these edges, which is added to SUMO on first use."""
         name = "route:" + ">".join(edges)
         if edges not in self._routes:
-            self._sumo.route.add(name, list(edges))
+            unwrapped(self._sumo, "route", "add")(name, list(edges))
             self._routes.add(edges)
         return name
 
@@ -270,7 +270,7 @@ class Session:
     def remove(self, prefix: str = "") -> None:
         """Remove what was inserted; with a prefix, only objects whose names start with it."""
         for domain, name in [entry for entry in self._inserted if entry[1].startswith(prefix)]:
-            getattr(self._sumo, domain).remove(name)
+            unwrapped(self._sumo, domain, "remove")(name)
         self._inserted = [entry for entry in self._inserted if not entry[1].startswith(prefix)]
 
     def _load(self, setup: Loadable, seed: int, isolation: str) -> None:
