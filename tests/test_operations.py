@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -158,18 +159,27 @@ def test_a_report_says_what_it_leaves_out_and_leaves_no_old_figures(tmp_path: Pa
     assert (figure.parent / "mine.svg").exists(), "not one of its figures"
 
 
+EXECUTORS = [{"kind": "serial"}, {"kind": "local", "workers": 1}]
+
+
+def write_traffic(folder: Path, more: str = "") -> Path:
+    """Write a scenario of a vehicle that nears a slower one, and return the file of the slower one."""
+    (folder / "a.net.xml").write_text(net({"road": [(0.0, 0.0), (900.0, 0.0)]}))
+    traffic = folder / "traffic.rou.xml"
+    lead = vehicle("lead", "road", "slow", departPos=100, departSpeed=5)
+    traffic.write_text(f'<routes><vType id="slow" sigma="0" maxSpeed="5"/>{lead}{more}</routes>')
+    ego = vehicle("ego", "road", "own", departPos=20, departSpeed="${v}")
+    (folder / "ego.rou.xml").write_text(f'<routes><vType id="own" sigma="0" maxSpeed="30"/>{ego}</routes>')
+    (folder / "scenario.yaml").write_text(ROAD)
+    return traffic
+
+
 @pytest.mark.sumo
-@pytest.mark.parametrize("executor", [{"kind": "serial"}, {"kind": "local", "workers": 1}])
+@pytest.mark.parametrize("executor", EXECUTORS)
 @pytest.mark.parametrize("gone", [False, True])
 def test_no_row_is_of_traffic_that_was_edited_while_the_campaign_ran(tmp_path: Path, executor: dict[str, object], gone: bool):
     """Runs load SUMO's files anew: what was run before is kept, and the rows are the same once the file is put back."""
-    (tmp_path / "a.net.xml").write_text(net({"road": [(0.0, 0.0), (900.0, 0.0)]}))
-    traffic = tmp_path / "traffic.rou.xml"
-    lead = vehicle("lead", "road", "slow", departPos=100, departSpeed=5)
-    traffic.write_text(f'<routes><vType id="slow" sigma="0" maxSpeed="5"/>{lead}</routes>')
-    ego = vehicle("ego", "road", "own", departPos=20, departSpeed="${v}")
-    (tmp_path / "ego.rou.xml").write_text(f'<routes><vType id="own" sigma="0" maxSpeed="30"/>{ego}</routes>')
-    (tmp_path / "scenario.yaml").write_text(ROAD)
+    traffic = write_traffic(tmp_path)
     before = traffic.read_text()
 
     def edit(progress: sbt.Progress) -> None:
@@ -189,6 +199,93 @@ def test_no_row_is_of_traffic_that_was_edited_while_the_campaign_ran(tmp_path: P
     assert whole.frame[columns].equals(undisturbed.frame[columns])
 
 
+def rows_with(scenario: str, executor: dict[str, object], change: Callable[[], object]) -> int:
+    """Return how many rows a campaign has during which something is changed."""
+
+    def at_work(progress: sbt.Progress) -> None:
+        if progress.done >= 8:
+            change()
+
+    asked = {"campaign": "coverage", "budget": 24, "batch": 6, "seed": 5, "executor": executor, "report": False}
+    path = Path(scenario.removesuffix(":S"))
+    return len(sbt.run(scenario=scenario, store=path.parent / "s", progress=at_work, **asked).frame)
+
+
+@pytest.mark.sumo
+@pytest.mark.parametrize("executor", EXECUTORS)
+def test_the_network_of_a_scene_in_python_is_a_file_that_runs_load_anew(tmp_path: Path, executor: dict[str, object]):
+    write_traffic(tmp_path)
+    network = tmp_path / "a.net.xml"
+    (tmp_path / "own.py").write_text(SCENE.format(network=network))
+    shorter = network.read_text().replace("900", "800")
+    with pytest.raises(InputError, match=r"SUMO's files must stay .* but changed: .*a.net.xml; put it back"):
+        rows_with(f"{tmp_path / 'own.py'}:S", executor, lambda: network.write_text(shorter))
+
+
+@pytest.mark.sumo
+def test_files_of_other_scenarios_of_the_session_end_no_campaign(tmp_path: Path):
+    folders = [tmp_path / name for name in "ab"]
+    for folder in folders:
+        folder.mkdir()
+    _, other = map(write_traffic, folders)
+    sbt.simulate(str(folders[1] / "scenario.yaml"), {"v": 10.0})
+    assert rows_with(str(folders[0] / "scenario.yaml"), {"kind": "serial"}, lambda: other.write_text("<routes/>")) == 24
+
+
+@pytest.mark.sumo
+@pytest.mark.parametrize("executor", EXECUTORS)
+@pytest.mark.parametrize("moved", [False, True])
+def test_a_link_is_what_it_leads_to(tmp_path: Path, executor: dict[str, object], moved: bool):
+    """Whatever the file there is called, and also where the link is changed."""
+    link, stored = write_traffic(tmp_path), [tmp_path / "3f2a", tmp_path / "77c0"]
+    stored[1].write_text(link.read_text().replace("300", "200"))
+    link.rename(stored[0])
+    link.symlink_to(stored[0])
+
+    def change() -> None:
+        if moved:
+            link.unlink()
+            link.symlink_to(stored[1])
+        else:
+            stored[0].write_text(stored[1].read_text())
+
+    with pytest.raises(InputError, match=r"SUMO's files must stay .* but changed: \S*/traffic.rou.xml; put it back"):
+        rows_with(str(tmp_path / "scenario.yaml"), executor, change)
+
+
+@pytest.mark.sumo
+@pytest.mark.parametrize("executor", EXECUTORS)
+@pytest.mark.parametrize("edited", [False, True])
+def test_a_large_file_is_what_is_in_it(tmp_path: Path, executor: dict[str, object], edited: bool):
+    """Not when it was written."""
+    traffic = write_traffic(tmp_path, "<!-- x -->\n" * 400_000)
+    text = traffic.read_text()
+    if edited:
+        with pytest.raises(InputError, match=r"SUMO's files must stay .* but changed: .*traffic.rou.xml; put it back"):
+            rows_with(str(tmp_path / "scenario.yaml"), executor, lambda: traffic.write_text(text.replace("300", "200")))
+    else:
+        assert rows_with(str(tmp_path / "scenario.yaml"), executor, traffic.touch) == 24
+
+
+SCENE = """import sbt
+from sbt.metrics.planar import distance_min
+from sbt.problem.scenario import LogicalScenario
+from sbt.sumo.actors import Action, Actor, Scene
+from sbt.sumo.simulation import SumoSimulation
+
+class Steady:
+    def act(self, t, own, others):
+        return Action(acceleration=0.0)
+
+def scene(values, ego, rng):
+    cars = (("ego", 50.0, values["v"]), ("co", 300.0, 5.0))
+    return Scene(tuple(Actor(name, ("road",), 0, at, speed, Steady()) for name, at, speed in cars))
+
+S = LogicalScenario(
+    "own", sbt.ParameterSpace((sbt.Parameter("v", 5, 20),)), simulate=SumoSimulation("{network}", scene, 3.0),
+    metrics=(distance_min(),), requirement=sbt.Requirement("distance_min", high=200.0),
+)
+"""
 ROAD = """sumo: {net: a.net.xml, routes: [traffic.rou.xml, ego.rou.xml]}
 inputs: {v: {min: 5, max: 20}}
 ego: {id: ego, may_leave: true}

@@ -27,14 +27,14 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any, Self
 
-from sbt.errors import InputError, PluginError, SbtError, described
+from sbt.errors import InputError, SbtError
 from sbt.execution.pool import broken, close_pool, how_ended, open_pool
 from sbt.execution.protocol import chunk_of
 from sbt.execution.spec import ScenarioSpec
 from sbt.execution.starting import start_apart
 from sbt.execution.streams import open_missing
-from sbt.execution.worker import run_at_levels
-from sbt.plugins import check_loaded_anew, contents_read
+from sbt.execution.worker import prepare, run_at_levels
+from sbt.plugins import LoadedAnew, contents_read
 from sbt.problem.outcome import Job, Outcome, Status
 from sbt.problem.scenario import LogicalScenario
 from sbt.processes import scratch
@@ -297,38 +297,34 @@ def _scenario(folder: str, level: int = 0) -> LogicalScenario:
     """Return the scenario that the driver wrote for its workers, at a level of fidelity."""
     spec, timeout = pickle.loads(Path(folder, _SCENARIO).read_bytes())
     scenario: LogicalScenario = spec.at_level(level).resolve()
-    try:
-        scenario.prepare()
-        return scenario.limited(timeout)
-    except SbtError:
-        raise
-    except BaseException as error:  # a user's code must not end the driver
-        raise PluginError(f"scenario {scenario.name} must be prepared without an error, but raised {described(error)}") from None
+    prepare(scenario)
+    return scenario.limited(timeout)
 
 
 def _prepare(folder: str, workers: int) -> Mapping[str, str]:
     """Load the scenario in a worker, and wait until every worker does; return what is in the files that it read."""
-    _scenario(folder)
+    with _loaded_anew(folder).unchanged():
+        _scenario(folder)
     settle()
     _limit_memory(folder)
     _mark(folder, ())
     marks, deadline = Path(folder, _MARKS), time.monotonic() + 20.0
     while len(os.listdir(marks)) < workers and time.monotonic() < deadline:  # noqa: PTH208  (fast)
         time.sleep(0.005)
-    return _contents(folder)
+    return contents_read()
 
 
 @cache
-def _contents(folder: str) -> Mapping[str, str]:
-    """Return what is in the files that this worker has read for the scenario, as it was when it was first asked."""
+def _loaded_anew(folder: str) -> LoadedAnew:
+    """Return the files that the runs of this worker load anew."""
     del folder
-    return contents_read()
+    return LoadedAnew()
 
 
 def _run_chunk(folder: str, jobs: list[Job]) -> list[Outcome]:
     """Run jobs in a worker and record which are in progress."""
-    outcomes = run_at_levels(partial(_scenario, folder), jobs, partial(_mark, folder))
-    check_loaded_anew(_contents(folder))
+    with _loaded_anew(folder).unchanged():
+        outcomes = run_at_levels(partial(_scenario, folder), jobs, partial(_mark, folder))
     for outcome in outcomes if _limit(folder) else ():
         if outcome.reason.startswith(_TOO_LARGE):  # what earlier runs left may be to blame: tried again alone, as after a death
             _mark(folder, (outcome.index,))

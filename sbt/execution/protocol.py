@@ -6,7 +6,7 @@ import os
 import sys
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Protocol, Self, runtime_checkable
@@ -14,8 +14,8 @@ from typing import Protocol, Self, runtime_checkable
 from sbt import interruption
 from sbt.execution.spec import ScenarioSpec
 from sbt.execution.streams import open_missing
-from sbt.execution.worker import run_at_levels, run_job
-from sbt.plugins import check_loaded_anew, contents_read
+from sbt.execution.worker import prepare, run_at_levels, run_job
+from sbt.plugins import LoadedAnew
 from sbt.problem.outcome import Job, Outcome
 from sbt.problem.scenario import Batched
 
@@ -88,13 +88,16 @@ class SerialExecutor:
     apart = False
 
     def __init__(self, spec: ScenarioSpec, timeout: float | None = None):
-        self._scenarios = tuple(level.resolve().limited(timeout) for level in spec.levels)
-        self._contents: Mapping[str, str] = {}
+        self._files = LoadedAnew()
+        with self._files.unchanged():
+            self._scenarios = tuple(level.resolve().limited(timeout) for level in spec.levels)
 
     def __enter__(self) -> Self:
-        """Return the executor."""
+        """Let the scenario load what is slow to load."""
         open_missing()
-        self._contents = contents_read()
+        with self._files.unchanged():
+            for scenario in self._scenarios:
+                prepare(scenario)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -116,10 +119,10 @@ class SerialExecutor:
         while queue:
             simulate = self._scenarios[queue[0].level].simulate
             together = isinstance(simulate, Batched) and simulate.batched
-            with interruption.handled():  # which tells Ctrl-C from a KeyboardInterrupt that the scenario's code raises
-                outcomes = self._together(queue) if together else self._alone(queue)
-            _restore(place, depth)
-            check_loaded_anew(self._contents)
+            with self._files.unchanged():
+                with interruption.handled():  # which tells Ctrl-C from a KeyboardInterrupt that the scenario's code raises
+                    outcomes = self._together(queue) if together else self._alone(queue)
+                _restore(place, depth)
             yield outcomes
 
     def _together(self, queue: deque[Job]) -> list[Outcome]:

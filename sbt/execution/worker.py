@@ -15,13 +15,13 @@ from itertools import groupby
 import numpy as np
 
 from sbt import interruption
-from sbt.errors import InputError, RunError, described
+from sbt.errors import InputError, PluginError, RunError, SbtError, described
 from sbt.metrics.physics import beyond_tyres, stopped_dead
 from sbt.problem.outcome import IMPOSSIBLE, STOPPED, Job, Outcome, Status
 from sbt.problem.scenario import Batched, LogicalScenario
 from sbt.problem.trace import Trace
 
-__all__ = ["run_at_levels", "run_job", "run_jobs", "run_traced", "versions"]
+__all__ = ["prepare", "run_at_levels", "run_job", "run_jobs", "run_traced", "versions"]
 
 _simulating = threading.RLock()
 """SUMO has one simulation a process: threads take turns, run by run."""
@@ -29,6 +29,23 @@ if hasattr(os, "register_at_fork"):  # not on Windows, which has no fork
     os.register_at_fork(after_in_child=lambda: _simulating._at_fork_reinit())  # type: ignore[attr-defined]
 _Measured = tuple[dict[str, float], str, str]
 """Metrics, SUMO's own collision list, and what differs between it and the contacts."""
+
+
+def prepare(scenario: LogicalScenario) -> None:
+    """Let a scenario load what is slow to load, before its first run.
+
+    Raises:
+        InputError: a file is not as required.
+        PluginError: its code raises.
+    """
+    try:
+        scenario.prepare()
+    except SbtError:
+        raise
+    except BaseException as error:  # a user's code must not end the driver
+        if interruption.is_interruption(error):
+            raise
+        raise PluginError(f"scenario {scenario.name} must be prepared without an error, but raised {described(error)}") from None
 
 
 def run_job(scenario: LogicalScenario, job: Job) -> Outcome:

@@ -9,13 +9,13 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 import os
-import re
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, field
-from functools import cache, partial
+from functools import cache, partial, wraps
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -26,7 +26,7 @@ from sbt.plugins.approval import check_approved, modules_of, named_by
 from sbt.plugins.source import FromSource, import_from_source
 
 __all__ = [
-    "KINDS", "OBJECT", "Objects", "Scope", "check_loaded_anew", "contents_read", "forget_changed", "forget_files", "kept", "load",
+    "KINDS", "OBJECT", "LoadedAnew", "Objects", "Scope", "contents_read", "forget_changed", "forget_files", "kept", "load",
     "names", "newer", "noted", "read_files",
 ]  # fmt: skip
 
@@ -40,8 +40,7 @@ KINDS = ("scenarios", "sources", "metamodels", "acquisitions", "metrics", "contr
 """`sources` are prefixes of scenario names: `table:FOLDER` is what the source `table` makes of FOLDER"""
 _LOCK = threading.Lock()
 _LARGE = 2**22
-"""Size (bytes) up to which the contents of files are compared."""
-_SUMO_FILES = re.compile(r"\.(xml|sumocfg)(\.gz)?$")
+"""Size (bytes) from which on a file is read once a state for its hash."""
 _SHORT = 8
 """Digits of a hash that people are shown."""
 _USER = "sbt_user_"
@@ -49,21 +48,55 @@ _USER = "sbt_user_"
 T = TypeVar("T")
 F = TypeVar("F", bound=Callable[..., Any])
 _stamps: dict[Path, tuple[int, int]] = {}
+_loaded_anew: ContextVar[set[Path]] = ContextVar("_loaded_anew", default=set())  # noqa: B039  (what nobody collects)
 _forgetters: list[Callable[[], None]] = []
 _scenarios_of: dict[tuple[Path, str], tuple[Path, ...]] = {}
 
 
-def noted(path: Path) -> Path:
-    """Return the path of a user's file, and remember its state as what `kept` functions made of it belongs to that state."""
-    _stamps.setdefault(path, _stamp(path))
+def noted(path: Path, *, loaded_anew: bool = False) -> Path:
+    """Return the path of a user's file, and remember its state as what `kept` functions made of it belongs to that state.
+
+    Args:
+        path: of the file, or of a link to it.
+        loaded_anew: SUMO loads it in every run, whatever this process has read of it.
+    """
+    place = path.absolute()
+    _stamps.setdefault(place, _stamp(place))
+    if loaded_anew:
+        _loaded_anew.get().add(place)
     return path
 
 
 def kept(function: F) -> F:
     """Keep what a function made of the user's files, once a process and arguments, until one of the files changes."""
-    cached: Any = cache(function)
-    _forgetters.append(cached.cache_clear)
-    return cast("F", cached)
+
+    @cache
+    def made(*args: Any, **kwargs: Any) -> tuple[Any, set[Path]]:
+        with _collected() as files:
+            value = function(*args, **kwargs)
+        return value, files
+
+    @wraps(function)
+    def asked(*args: Any, **kwargs: Any) -> Any:
+        value, files = made(*args, **kwargs)
+        if files:
+            _loaded_anew.get().update(files)
+        return value
+
+    _forgetters.append(made.cache_clear)
+    return cast("F", asked)
+
+
+@contextmanager
+def _collected() -> Iterator[set[Path]]:
+    """Yield the files that SUMO loads in every run, of those that are read in this context, or were for what is kept."""
+    files: set[Path] = set()
+    before = _loaded_anew.set(files)
+    try:
+        yield files
+    finally:
+        _loaded_anew.reset(before)
+        _loaded_anew.get().update(files)
 
 
 def forget_changed() -> None:
@@ -94,38 +127,61 @@ def read_files() -> list[Path]:
     return sorted({file for path in found for file in (modules_of(path) if path.suffix == ".py" else (path,))})
 
 
-def contents_read(*, whole: bool = False) -> dict[str, str]:
-    """Return what is in the user's files that this process has read: a hash, of large ones when they were changed.
-
-    Args:
-        whole: of large ones too it is a hash of what is in them.
-    """
-    return {str(path): _content(path, whole=whole) for path in read_files()}
+def contents_read() -> dict[str, str]:
+    """Return what is in the user's files that this process has read: a hash by their paths."""
+    return {str(path): _content(path) for path in read_files()}
 
 
-def check_loaded_anew(contents: Mapping[str, str]) -> None:
-    """Check that SUMO's files, which runs load anew, are what they were when a campaign began.
+class LoadedAnew:
+    """The files of a campaign that SUMO loads in every run, each as it was when the campaign first read it."""
 
-    Args:
-        contents: of the files as they were then (`contents_read`).
+    def __init__(self) -> None:
+        self._begun: dict[Path, tuple[tuple[int, int], str]] = {}
 
-    Raises:
-        InputError: one has changed, or is not there any more.
-    """
-    if all(_stamp(path) == state for path, state in _stamps.items()):
-        return
-    now = contents_read()
-    changed = [path for path, was in contents.items() if _SUMO_FILES.search(path) and now.get(path) != was]
-    if changed:
-        rule = "SUMO's files must stay as they are while a campaign runs, as its runs load them"
-        raise InputError(f"{rule}, but changed: {', '.join(sorted(changed))}; put it back and run again, or choose another store")
+    @contextmanager
+    def unchanged(self) -> Iterator[None]:
+        """Let the campaign prepare its runs, or make some, and check that the files are what they were.
+
+        Raises:
+            InputError: one has changed, or is not there any more.
+        """
+        with _collected() as files:
+            yield
+        known = self._begun.items()
+        changed = {path for path, (stamp, was) in known if _stamp(path) != stamp and _content(path) != was}
+        if changed:
+            rule = "SUMO's files must stay as they are while a campaign runs, as its runs load them"
+            linked = {path.resolve() for path in changed if path.resolve() != path}
+            told = ", ".join(sorted(map(str, changed - linked)))
+            raise InputError(f"{rule}, but changed: {told}; put it back and run again, or choose another store")
+        self._begun |= {path: (_stamp(path), _content(path)) for path in files - self._begun.keys()}
 
 
-def _content(path: Path, *, whole: bool = False) -> str:
-    """Return a hash of what is in a file, of a large one of when it was changed, unless the whole is asked for."""
+def _print(path: Path) -> str:
+    """Return a print of a file that people are shown: of what is in it, of a large one of when it was changed."""
     state = _stamp(path)
-    content = repr(state).encode() if state[1] > _LARGE and not whole else path.read_bytes()
-    return hashlib.blake2b(content, digest_size=16).hexdigest()
+    return (hashlib.blake2b(repr(state).encode(), digest_size=16).hexdigest() if state[1] > _LARGE else _content(path))[:_SHORT]
+
+
+def _content(path: Path) -> str:
+    """Return a hash of what is in a file; "" where there is none."""
+    state = _stamp(path)
+    try:
+        return _hash(path) if state[1] <= _LARGE else _hash_of_state(path.resolve(), state)
+    except OSError:
+        return ""
+
+
+def _hash(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, partial(hashlib.blake2b, digest_size=16)).hexdigest()
+
+
+@cache
+def _hash_of_state(path: Path, state: tuple[int, int]) -> str:
+    """Return the hash of a large file, which is read once a state."""
+    del state
+    return _hash(path)
 
 
 def _stamp(path: Path) -> tuple[int, int]:
@@ -167,7 +223,7 @@ class Scope:
                 files |= set(modules_of(file)) if file.is_file() else set()
             elif name.endswith((".yaml", ".yml")) or name.startswith("table:"):
                 files |= set(self._read_for(name))
-        return {os.path.relpath(each, self.folder.resolve()): _content(each)[:_SHORT] for each in sorted(files)}
+        return {os.path.relpath(each, self.folder.resolve()): _print(each) for each in sorted(files)}
 
     def _read_for(self, scenario: str) -> tuple[Path, ...]:
         """Return the files that a scenario is made of; found out once a process."""

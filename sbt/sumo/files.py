@@ -16,12 +16,13 @@ from functools import cached_property
 from pathlib import Path
 
 from sbt.errors import InputError
+from sbt.plugins import noted
 from sbt.problem.plain import Values
 from sbt.sumo.demand import seconds_of
 from sbt.sumo.formatting import format_number
 from sbt.sumo.outputs import begin_outputs
-from sbt.sumo.places import place_in
-from sbt.sumo.template import Placeholder, Template, Vehicle, fill, placeholders, template, tried
+from sbt.sumo.places import made_here, place_in
+from sbt.sumo.template import Placeholder, Template, Vehicle, fill, linked, placeholders, template, tried
 
 __all__ = ["FIXED_OPTIONS", "Launch", "SumoFiles", "options_of_command", "options_of_config"]
 
@@ -139,6 +140,8 @@ class SumoFiles:
             for path in map(Path, _split(value) if _names_files(name) else ()):
                 if path.name.endswith((".xml", ".xml.gz")) and path.is_file():
                     template(path)
+                elif path.is_file() and not made_here(path):
+                    noted(path, loaded_anew=True)
         _check_net(template(self.net))
         _check_ids(found)
         return found
@@ -288,7 +291,7 @@ def _split(value: str) -> list[str]:
 
 
 def _existing(option: str, name: str, folder: Path, place: str) -> Path:
-    path = (folder / Path(name).expanduser()).resolve()
+    path = linked(folder / Path(name).expanduser())
     if "${" in name:
         raise InputError(f"{place}: {option} must not hold a placeholder (their values may), but got '{name}'")
     if not path.is_file():
@@ -305,7 +308,7 @@ def _absolute(option: str, value: str, folder: Path) -> str:
     if not _names_files(option):
         return value
     return ",".join(
-        str((folder / name).resolve()) if (folder / name).exists() or option in _FILES else name for name in _split(value)
+        str(linked(folder / name)) if (folder / name).exists() or option in _FILES else name for name in _split(value)
     )
 
 

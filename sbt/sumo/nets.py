@@ -73,7 +73,7 @@ def net_file(net: str) -> Path:
     if not path.is_file():
         known = ", ".join(sorted(p.name for p in nets_folder().iterdir() if p.is_dir()))
         raise InputError(f"a network must be one of {known}, or an existing .net.xml file, but got '{net}'")
-    _check_well_formed(path if made_here(path) else noted(path))
+    _check_well_formed(path if made_here(path) else noted(path, loaded_anew=True))
     return path.resolve()
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import gzip
 import io
 import math
+import os
 import re
 import xml.parsers.expat
 import zlib
@@ -31,7 +32,7 @@ from sbt.problem.plain import Values
 from sbt.sumo.outputs import MARKS, in_signals, names_output, output_names, run_file
 from sbt.sumo.places import made_here, place_in
 
-__all__ = ["Placeholder", "Template", "Vehicle", "fill", "placeholders", "template", "tried"]
+__all__ = ["Placeholder", "Template", "Vehicle", "fill", "linked", "placeholders", "template", "tried"]
 
 _PLACEHOLDER = re.compile(r"\$\{([^{}]*)\}")
 _ALONE = re.compile(rb"([\w.:-]+)\s*=\s*[\"']\s*$")
@@ -266,6 +267,14 @@ def _in_utf8(data: bytes, path: Path) -> bytes:
     return declared[1] + b"UTF-8" + text.encode()[declared.end(2) :]
 
 
+def linked(path: Path) -> Path:
+    """Return the file that a path names; where links lead there, SUMO's file is another one once these are changed."""
+    target = path.resolve()
+    if target.is_file() and not made_here(target) and target != Path(os.path.normpath(path.absolute())):
+        noted(path, loaded_anew=True)
+    return target
+
+
 @kept
 def template(path: Path) -> Template:
     """Parse an XML file; each file is read once per process.
@@ -274,7 +283,7 @@ def template(path: Path) -> Template:
         InputError: it cannot be read, is not well-formed XML, declares a document type or entities, or has a
             placeholder that is not a formula; the message begins with file, line and column.
     """
-    data = _read(path if made_here(path) else noted(path))
+    data = _read(path if made_here(path) else noted(path, loaded_anew=True))
     if b"\0" in data[:_HEAD]:
         raise InputError(f"{path}: a SUMO file must be encoded byte by byte (UTF-8), but it has zero bytes")
     parser = xml.parsers.expat.ParserCreate()
@@ -333,7 +342,7 @@ def _parts(path: Path, data: bytes, at: int, tag: str, place: str, *, writes: bo
     if tag in _REFERRING:
         for match in _REFERENCE.finditer(text):
             name = match.group(2)[1:-1].decode()
-            target = (path.parent / name).resolve()
+            target = linked(path.parent / name)
             if tag == "include" and not target.is_file():
                 raise InputError(f"{place}: an included file must exist, but got '{name}'")
             if target.is_file():

@@ -41,7 +41,7 @@ def package_print() -> str:
 
 def contents_in(folder: Path) -> Json:
     """Return what a store remembers of the files that this process has read, by their paths seen from a folder."""
-    found = contents_read(whole=True)
+    found = contents_read()
     return {os.path.relpath(path, folder.resolve()): was for path, was in found.items() if not is_installed(Path(path))}
 
 
@@ -56,7 +56,7 @@ def changed_files(folder: Path, kept: JsonMapping) -> list[Path]:
     """
     place = place_of(kept, folder)[0].resolve()
     known = {os.path.normpath(place / name): was for name, was in kept.get(CONTENTS, {}).items()}
-    differing = [Path(path) for path, now in contents_read(whole=True).items() if known.get(path, now) != now]
+    differing = [Path(path) for path, now in contents_read().items() if known.get(path, now) != now]
     later = newer(folder / RESOLVED) if (folder / RESOLVED).is_file() else []
     unknown = {path.resolve() for path in later if not is_installed(path)}
     return sorted({*differing, *(path for path in unknown if str(path) not in known)})
