@@ -238,7 +238,7 @@ def test_files_of_other_scenarios_of_the_session_end_no_campaign(tmp_path: Path)
 def test_a_link_is_what_it_leads_to(tmp_path: Path, executor: dict[str, object], moved: bool):
     """Whatever the file there is called, and also where the link is changed."""
     link, stored = write_traffic(tmp_path), [tmp_path / "3f2a", tmp_path / "77c0"]
-    stored[1].write_text(link.read_text().replace("300", "200"))
+    stored[1].write_text(link.read_text().replace("100", "90"))
     link.rename(stored[0])
     link.symlink_to(stored[0])
 
@@ -262,7 +262,7 @@ def test_a_large_file_is_what_is_in_it(tmp_path: Path, executor: dict[str, objec
     text = traffic.read_text()
     if edited:
         with pytest.raises(InputError, match=r"SUMO's files must stay .* but changed: .*traffic.rou.xml; put it back"):
-            rows_with(str(tmp_path / "scenario.yaml"), executor, lambda: traffic.write_text(text.replace("300", "200")))
+            rows_with(str(tmp_path / "scenario.yaml"), executor, lambda: traffic.write_text(text.replace("100", "90")))
     else:
         assert rows_with(str(tmp_path / "scenario.yaml"), executor, traffic.touch) == 24
 
