@@ -261,7 +261,8 @@ def test_the_conflict_type_is_side_and_course_wherever_north_is(side, course, of
              turn + math.radians(90 * course + askew))]  # fmt: skip
     poses.append((x + 99.0, y, 0.0))  # further away
     now = np.array(poses)
-    before = now + [20.0, 0.0, 1.0] * np.arange(3)[:, None]  # further away still
+    away = np.array([[0.0, 0.0, 0.0], [20.0 * math.cos(turn + bearing), 20.0 * math.sin(turn + bearing), 1.0], [40.0, 0.0, 2.0]])
+    before = now + away  # further away still, where none drives through another on its way
     xs, ys, headings = np.moveaxis(np.stack([before, now, np.full_like(now, np.nan)]), 2, 0).copy()
     still = np.zeros_like(xs)
     sizes = np.full(3, 2.0), np.full(3, 2.0)  # as wide as long: bearings alone decide
