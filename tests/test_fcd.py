@@ -312,3 +312,14 @@ def test_who_is_put_past_another_by_sumo_has_not_driven_through_it(tmp_path: Pat
     assert len(list(encounters(read_fcd(written(tmp_path, "b.xml", as_xml(beside))), 100.0))) == 2
     wrong = [one | {"speed": 0.1 * one["speed"]} for one in DRIVE]
     assert len(list(encounters(read_fcd(written(tmp_path, "c.xml", as_xml(wrong))), 100.0))) == 2
+
+
+def test_recordings_of_few_times_and_of_noise_are_not_cut(tmp_path: Path) -> None:
+    """Who stands at both of two times may have moved up between them, and a place is known to half a metre."""
+    rng = np.random.Generator(np.random.PCG64(1))
+    queue = [row(2.0 * k, name, x + 3.0 * (k > 4), speed=0.0) for k in range(10) for name, x in (("7", 0.0), ("8", 9.0))]
+    noisy = [row(float(k), name, x + v * k + 0.5 * rng.standard_normal(), speed=v)
+             for k in range(60) for name, x, v in (("7", 0.0, 10.0), ("8", 30.0, 10.0), ("9", 60.0, 0.0))]  # fmt: skip
+    for k, rows in enumerate((queue, noisy)):
+        recording = read_fcd(written(tmp_path, f"{k}.xml", as_xml(rows)))
+        assert len(list(pair_traces(recording, 0, 1))) == 1

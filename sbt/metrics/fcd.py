@@ -39,8 +39,8 @@ __all__ = ["PERSON_SIZE", "Recording", "catalogue", "encounters", "near_pairs", 
 
 PERSON_SIZE = (0.215, 0.478)
 """Length and width of a person whose size is not in the file (m): SUMO's default pedestrian."""
-_ABLE, _INEXACT, _RARE = 10.0, 1.0, 0.1
-"""Who is farther ahead than by such an acceleration (m/s^2), and this far (m), was teleported: in at most this share of steps."""
+_ABLE, _INEXACT, _RARE, _FEW = 10.0, 1.0, 0.01, 2
+"""Who is farther ahead than by such accelerations (m/s^2), and this far (m), was teleported: in this share of steps, or few."""
 _COLUMNS = ("time", "x", "y", "angle", "speed", "acceleration", "length", "width", "z", "slope")
 _REQUIRED = ("time", "id", "x", "y", "angle", "speed")
 _KINDS = ("vehicle", "person")
@@ -208,9 +208,11 @@ def _goes_on(user: Integers, step: Integers, time: Vector, states: tuple[Vector,
     follows = (np.diff(user) == 0) & (np.diff(step) == 1)
     driven = follows & (np.hypot(dx, dy) <= farthest(elapsed))
     ahead = dx * np.cos(heading[:-1]) + dy * np.sin(heading[:-1])
-    able = np.minimum(np.maximum(speed[1:], speed[:-1]), speed[:-1] + _ABLE * elapsed)
-    explained = driven & (ahead <= able * elapsed + _INEXACT)
-    return explained if (driven & ~explained).sum() <= _RARE * driven.sum() else driven
+    begin, change = speed[:-1], _ABLE * elapsed
+    end = np.clip(speed[1:], begin - change, begin + change)
+    peak = 0.5 * (begin + end + change)  # who accelerates as long as it can, and brakes then, is farthest
+    explained = driven & (ahead <= (2.0 * peak**2 - begin**2 - end**2) / (2.0 * _ABLE) + _INEXACT)
+    return explained if (driven & ~explained).sum() <= max(_RARE * driven.sum(), _FEW) else driven
 
 
 def _differences(speed: Vector, time: Vector, goes_on: Mask) -> Vector:
