@@ -14,7 +14,7 @@ from sbt.problem.trace import ActorTrace
 
 __all__ = ["least_distance"]
 
-_EXACT = 0.02
+_EXACT = 0.05
 """A step in which they can be nearer by no more than this is not looked into (m)."""
 _SHARES, _ROUNDS = 16, 2
 """Half the parts of a step that are compared at a time, and how often; those about the best are divided again."""
@@ -68,10 +68,12 @@ def _least_of_rectangles(a: ActorTrace, b: ActorTrace, least: float) -> float:
 
 def _steady(dx: Vector, dy: Vector, steps: np.ndarray) -> Mask:
     """Return (n,) whether two move relative to each other in steps much as in the steps before and after."""
-    x, y = (np.pad(d[1:] - d[:-1], 1, constant_values=np.nan) for d in (dx, dy))
-    before, here, after = ((x[steps + k], y[steps + k]) for k in range(3))
-    most = _CHANGES * np.hypot(*here)
-    return np.logical_and(*(np.hypot(here[0] - beside[0], here[1] - beside[1]) < most for beside in (before, after)))
+    x, y = dx[1:] - dx[:-1], dy[1:] - dy[:-1]
+    known = (steps > 0) & (steps < len(x) - 1)
+    before, after = np.maximum(steps - 1, 0), np.minimum(steps + 1, len(x) - 1)
+    u, v = x[steps], y[steps]
+    most = _CHANGES**2 * (u * u + v * v)
+    return np.logical_and.reduce([known, *((x[k] - u) ** 2 + (y[k] - v) ** 2 < most for k in (before, after))])
 
 
 def _extended(distance: Vector, steps: np.ndarray) -> Vector:
