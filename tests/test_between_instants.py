@@ -14,7 +14,7 @@ from sbt.metrics.around import smallest_distance
 from sbt.metrics.exposure import tet, tit
 from sbt.metrics.paths import smallest_ttc_on_paths, ttc_on_paths
 from sbt.metrics.planar import distance_min, post_encroachment_time, severity, time_behind
-from sbt.metrics.rss import Rss, rss_lateral_min, rss_violation
+from sbt.metrics.rss import Rss, rss_lateral_min, rss_longitudinal_min, rss_violation
 from sbt.metrics.shifts import evenly
 from sbt.problem.trace import Trace
 
@@ -165,3 +165,17 @@ def test_who_turns_is_on_its_arc_from_instant_to_instant(radius, rate, gap, side
     assert (ttc_on_paths(coarse)[:3] == 5.0).all() == (gap > 0.0)
     if gap > 0.0:
         assert smallest_ttc_on_paths(coarse) == 5.0
+
+
+@pytest.mark.parametrize("step", [0.05, 0.1, 0.2, 0.5, 1.0])
+def test_the_margins_of_rss_end_as_the_two_begin_to_touch(step):
+    """At the instant after it the ego was past whom it hit: level with it, or without any duty."""
+    ways = {"ego": straight(-30.0, 0.0, 0.0, 20.0), "co": straight(0.0, 0.0, 0.0, 0.0)}
+    trace = trace_of(ways, (4.5, 1.8), step, 4.0)
+    contact = (30.0 - 4.5) / 20.0
+    assert rss_violation()(trace) == pytest.approx(contact)
+    assert rss_longitudinal_min()(trace) == pytest.approx(-float(Rss().same_direction(20.0, 0.0)))
+    assert rss_lateral_min()(trace) == 1000.0
+    behind = trace_of({"ego": ways["co"], "co": ways["ego"]}, (4.5, 1.8), step, 4.0)
+    for metric, value in ((rss_violation(), 0.0), (rss_longitudinal_min(), 1000.0), (rss_lateral_min(), 1000.0)):
+        assert metric(behind) == value

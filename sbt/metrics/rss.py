@@ -16,9 +16,9 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from sbt.errors import InputError
-from sbt.metrics.arcs import while_passing
+from sbt.metrics.arcs import after_shares, while_passing
 from sbt.metrics.exposure import integral
-from sbt.metrics.geometry import part_pairs, select_instants
+from sbt.metrics.geometry import contact_moment, part_pairs
 from sbt.metrics.longitudinal import FAR, first_contact
 from sbt.metrics.strips import turned_in_behind
 from sbt.problem.arrays import Mask, Vector
@@ -30,6 +30,8 @@ __all__ = ["Rss", "lateral_margin", "longitudinal_margin", "rss_lateral_min", "r
 _SOURCE = "Shalev-Shwartz, Shammah and Shashua (2017), arXiv 1708.06374"
 _MIN_COS = np.cos(np.pi / 4)
 """Of the angle between the courses of road users that are assessed."""
+_TOUCH = 1e-9
+"""Who is level by less than this (m) touches the other lengthwise."""
 
 
 @dataclass(frozen=True)
@@ -129,43 +131,37 @@ def _relation_of(a: ActorTrace, b: ActorTrace) -> _Relation:
     c, s = np.abs(np.cos(turn)), np.abs(np.sin(turn))
     gap = np.abs(along) - 0.5 * (a.length + b.length * c + b.width * s)
     clearance = np.abs(across) - 0.5 * (a.width + b.length * s + b.width * c)
-    return _Relation(gap, clearance, along >= 0, across >= 0, turn)
+    return _Relation(np.where(np.abs(gap) < _TOUCH, 0.0, gap), clearance, along >= 0, across >= 0, turn)
 
 
-def _behind(trace: Trace, ego: str, other: str, aside: Vector | float) -> Mask:
+def _behind(one: ActorTrace, two: ActorTrace, aside: Vector | float) -> Mask:
     """Return (t,) whether all of the other in the ego's path, so much wider (m), is behind: no duty is the ego's."""
-    found = np.ones(len(trace.time), dtype=bool)
-    for a, b in part_pairs(trace.actor(ego), trace.actor(other)):
+    found = np.ones(len(one.x), dtype=bool)
+    for a, b in part_pairs(one, two):
         r = _relation_of(a, b)
         clear, level = (r.clearance >= aside) | ((r.gap >= 0) & ~r.ahead), (r.gap < 0) & (r.clearance < aside)
         found &= clear | turned_in_behind(a, b, 0.5 * a.length, aside, level)
     return found
 
 
-def _until_contact(trace: Trace, ego: str, other: str) -> slice:
-    """Return the instants until the first contact of the two, all without one."""
+def _until_contact(trace: Trace, ego: str, other: str) -> tuple[ActorTrace, ActorTrace]:
+    """Return the two, from the instant of their first contact on as they were when they began to touch, within its step."""
+    a, b = trace.actor(ego), trace.actor(other)
     k = first_contact(trace, ego, other)
-    return slice(None if k is None else k + 1)
+    if k is None:
+        return a, b
+    row, moment = np.arange(len(a.x)), contact_moment(a, b, k) if k else 0.0
+    step, share = np.where(row < k, row, max(k - 1, 0)), np.where(row < k, 0.0, moment)
+    return after_shares(a, step, share), after_shares(b, step, share)
 
 
-def _held(trace: Trace, ego: str, other: str, values: Vector) -> Vector:
-    """Return the (t,) values; from the first contact of the two on that at it."""
-    k = first_contact(trace, ego, other)
-    return values if k is None else np.where(np.arange(len(values)) > k, values[k], values)
-
-
-def longitudinal_margin(trace: Trace, ego: str, other: str, margin: float = 0.0, rules: Rss = DEFAULT) -> Vector:
-    """Return the (t,) longitudinal distance minus the safe one (m), at any lateral position; 1,000 where the ego has no duty.
-
-    From the first contact on it stays.
-    """
-    r, own = _relation(trace.actor(ego), trace.actor(other)), trace.actor(ego).speed
+def _margin_along(r: _Relation, own: ActorTrace, other: ActorTrace, rules: Rss) -> Vector:
     cos = np.cos(r.turn)
-    along = np.abs(trace.actor(other).speed * cos)
-    same = rules.same_direction(np.where(r.ahead, own, along), np.where(r.ahead, along, own))
-    safe = np.where(cos > 0, same, rules.opposite_direction(own, along))
+    along = np.abs(other.speed * cos)
+    same = rules.same_direction(np.where(r.ahead, own.speed, along), np.where(r.ahead, along, own.speed))
+    safe = np.where(cos > 0, same, rules.opposite_direction(own.speed, along))
     assessed = (np.abs(cos) >= _MIN_COS) & (r.ahead | (r.gap < 0))
-    return _held(trace, ego, other, np.where(assessed, np.minimum(r.gap - safe, FAR), FAR))
+    return np.where(assessed, np.minimum(r.gap - safe, FAR), FAR)
 
 
 def _safe_aside(r: _Relation, other: ActorTrace, rules: Rss) -> Vector:
@@ -173,27 +169,37 @@ def _safe_aside(r: _Relation, other: ActorTrace, rules: Rss) -> Vector:
     return rules.sideways(np.zeros(len(leftwards)), np.where(r.left, leftwards, -leftwards))
 
 
+def _margin_aside(r: _Relation, other: ActorTrace, rules: Rss) -> Vector:
+    safe = _safe_aside(r, other, rules)
+    return np.where(np.abs(np.cos(r.turn)) >= _MIN_COS, np.minimum(r.clearance - safe, FAR), FAR)
+
+
+def longitudinal_margin(trace: Trace, ego: str, other: str, margin: float = 0.0, rules: Rss = DEFAULT) -> Vector:
+    """Return the (t,) longitudinal distance minus the safe one (m), at any lateral position; 1,000 where the ego has no duty.
+
+    From the first contact on it stays.
+    """
+    own, co = _until_contact(trace, ego, other)
+    return _margin_along(_relation(own, co), own, co, rules)
+
+
 def lateral_margin(trace: Trace, ego: str, other: str, margin: float = 0.0, rules: Rss = DEFAULT) -> Vector:
     """Return the (t,) lateral distance minus the safe one (m), at any longitudinal position; at most 1,000.
 
     From the first contact on it stays.
     """
-    a, b = trace.actor(ego), trace.actor(other)
-    return _held(trace, ego, other, _margin_aside(_relation(a, b), b, rules))
-
-
-def _margin_aside(r: _Relation, other: ActorTrace, rules: Rss) -> Vector:
-    safe = _safe_aside(r, other, rules)
-    return np.where(np.abs(np.cos(r.turn)) >= _MIN_COS, np.minimum(r.clearance - safe, FAR), FAR)
+    own, co = _until_contact(trace, ego, other)
+    return _margin_aside(_relation(own, co), co, rules)
 
 
 def rss_longitudinal_min(ego: str = "ego", other: str = "co", margin: float = 0.0, rules: Rss = DEFAULT) -> Metric:
     """Return the smallest longitudinal distance minus the safe one while the other is in the ego's path (m)."""
 
     def function(trace: Trace) -> float:
-        r = _relation(trace.actor(ego), trace.actor(other))
-        in_path, counted = (r.clearance < margin) & ~_behind(trace, ego, other, margin), _until_contact(trace, ego, other)
-        return float(longitudinal_margin(trace, ego, other, rules=rules)[counted][in_path[counted]].min(initial=FAR))
+        own, co = _until_contact(trace, ego, other)
+        r = _relation(own, co)
+        in_path = (r.clearance < margin) & ~_behind(own, co, margin)
+        return float(_margin_along(r, own, co, rules)[in_path].min(initial=FAR))
 
     return Metric(
         "rss_longitudinal_min", function, "m", "low", FAR,
@@ -205,7 +211,7 @@ def rss_lateral_min(ego: str = "ego", other: str = "co", rules: Rss = DEFAULT) -
     """Return the smallest lateral distance minus the safe one while the two are level (m), at instants or between them."""
 
     def function(trace: Trace) -> float:
-        own, co = (select_instants(trace.actor(name), _until_contact(trace, ego, other)) for name in (ego, other))
+        own, co = _until_contact(trace, ego, other)
         r, way = _relation(own, co), np.hypot(np.diff(co.x - own.x), np.diff(co.y - own.y))
         between = while_passing(own, co, r.gap[1:] + r.gap[:-1] < way)
         within = _relation(*between)
@@ -222,11 +228,11 @@ def rss_violation(ego: str = "ego", other: str = "co", rules: Rss = DEFAULT) -> 
     """Return the time during which both safe distances are violated (s), the dangerous situation of RSS, until a collision."""
 
     def function(trace: Trace) -> float:
-        longitudinal = longitudinal_margin(trace, ego, other, rules=rules)
-        dangerous = (longitudinal < 0) & (lateral_margin(trace, ego, other, rules=rules) < 0)
+        own, co = _until_contact(trace, ego, other)
+        r = _relation(own, co)
+        dangerous = (_margin_along(r, own, co, rules) < 0) & (_margin_aside(r, co, rules) < 0)
         if dangerous.any():
-            safe = _safe_aside(_relation(trace.actor(ego), trace.actor(other)), trace.actor(other), rules)
-            dangerous &= ~_behind(trace, ego, other, safe)
+            dangerous &= ~_behind(own, co, _safe_aside(r, co, rules))
         return integral(trace, dangerous, ego, other)
 
     return Metric(
