@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -179,3 +180,12 @@ def test_the_margins_of_rss_end_as_the_two_begin_to_touch(step):
     behind = trace_of({"ego": ways["co"], "co": ways["ego"]}, (4.5, 1.8), step, 4.0)
     for metric, value in ((rss_violation(), 0.0), (rss_longitudinal_min(), 1000.0), (rss_lateral_min(), 1000.0)):
         assert metric(behind) == value
+
+
+def test_a_car_beside_the_rear_of_a_bus_is_level_with_it_whether_or_not_it_has_parts():
+    """Of parts that are as far aside the first one decided, which was ahead of the car."""
+    whole = trace_of({"ego": straight(0.0, 0.0, 0.0, 10.0), "co": straight(-5.0, 7.0, 0.0, 10.0)}, (12.0, 2.0), 0.1, 1.0)
+    own = whole.actor("ego")
+    parts = tuple(replace(own, x=own.x + dx, length=4.0) for dx in (4.0, 0.0, -4.0))
+    sized = replace(whole, length=np.array([12.0, 4.0]))
+    assert rss_lateral_min()(replace(sized, parts={"ego": parts})) == pytest.approx(rss_lateral_min()(sized)) != 1000.0

@@ -320,6 +320,7 @@ def test_recordings_of_few_times_and_of_noise_are_not_cut(tmp_path: Path) -> Non
     queue = [row(2.0 * k, name, x + 3.0 * (k > 4), speed=0.0) for k in range(10) for name, x in (("7", 0.0), ("8", 9.0))]
     noisy = [row(float(k), name, x + v * k + 0.5 * rng.standard_normal(), speed=v)
              for k in range(60) for name, x, v in (("7", 0.0, 10.0), ("8", 30.0, 10.0), ("9", 60.0, 0.0))]  # fmt: skip
-    for k, rows in enumerate((queue, noisy)):
+    unknown = [row(0.1 * k, name, x + 1.2 * k, speed=v) for k in range(40) for name, x, v in (("7", 0.0, 0.0), ("8", 20.0, 12.0))]
+    for k, rows in enumerate((queue, noisy, unknown)):
         recording = read_fcd(written(tmp_path, f"{k}.xml", as_xml(rows)))
         assert len(list(pair_traces(recording, 0, 1))) == 1

@@ -40,7 +40,7 @@ __all__ = ["PERSON_SIZE", "Recording", "catalogue", "encounters", "near_pairs", 
 PERSON_SIZE = (0.215, 0.478)
 """Length and width of a person whose size is not in the file (m): SUMO's default pedestrian."""
 _ABLE, _INEXACT, _RARE, _FEW = 10.0, 1.0, 0.01, 2
-"""Who is farther ahead than by such accelerations (m/s^2), and this far (m), was teleported: in this share of steps, or few."""
+"""Who is farther ahead than by such accelerations (m/s^2), and this far (m), was teleported: in this share of its steps or few."""
 _COLUMNS = ("time", "x", "y", "angle", "speed", "acceleration", "length", "width", "z", "slope")
 _REQUIRED = ("time", "id", "x", "y", "angle", "speed")
 _KINDS = ("vehicle", "person")
@@ -195,7 +195,7 @@ def _check_metres(path: Path, data: dict[str, Vector], user: Integers) -> None:
 def _goes_on(user: Integers, step: Integers, time: Vector, states: tuple[Vector, Vector, Vector, Vector]) -> Mask:
     """Return (n - 1,) whether rows are followed by one of the same road user, at the next step, that it may have driven to.
 
-    Else it was away, or was teleported: farther ahead than by its speeds, if these are those of the positions elsewhere.
+    Else it was away, or was teleported: farther ahead than by its speeds, if these are those of its positions elsewhere.
 
     Args:
         user: (n,) of each row, sorted.
@@ -212,7 +212,9 @@ def _goes_on(user: Integers, step: Integers, time: Vector, states: tuple[Vector,
     end = np.clip(speed[1:], begin - change, begin + change)
     peak = 0.5 * (begin + end + change)  # who accelerates as long as it can, and brakes then, is farthest
     explained = driven & (ahead <= (2.0 * peak**2 - begin**2 - end**2) / (2.0 * _ABLE) + _INEXACT)
-    return explained if (driven & ~explained).sum() <= max(_RARE * driven.sum(), _FEW) else driven
+    of = user[:-1]
+    steps, teleports = (np.bincount(of[rows], minlength=user[-1] + 1) for rows in (driven, driven & ~explained))
+    return driven & (explained | (teleports > np.maximum(_RARE * steps, _FEW))[of])
 
 
 def _differences(speed: Vector, time: Vector, goes_on: Mask) -> Vector:

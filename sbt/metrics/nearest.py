@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from sbt.metrics.arcs import on_arcs
-from sbt.metrics.discs import is_person
+from sbt.metrics.discs import discs_of
 from sbt.metrics.geometry import part_pairs, rectangle_distance, select_instants
 from sbt.problem.arrays import Mask, Vector
 from sbt.problem.trace import ActorTrace
@@ -61,7 +61,7 @@ def _least_of_rectangles(a: ActorTrace, b: ActorTrace, least: float) -> float:
     if not steps.size:
         return least
     found, turned = _within(a, b, steps, bend=False), np.maximum(_turned(a, steps), _turned(b, steps)) > _TURNED
-    if turned.any():
+    if turned.any() and discs_of(a, b) is None:  # two persons are discs, which SUMO turns at once
         found[turned] = np.maximum(found[turned], _within(a, b, steps[turned], bend=True))
     return float(np.fmin.reduce(found, initial=least))
 
@@ -100,9 +100,7 @@ def _met(begin: Vector, end: Vector, falls: Vector, rises: Vector) -> Vector:
 
 
 def _turned(actor: ActorTrace, steps: np.ndarray) -> Vector:
-    """Return (n,) how far a corner moves in some steps because its rectangle turns (m); SUMO turns persons at once."""
-    if is_person(actor):
-        return np.zeros(len(steps))
+    """Return (n,) how far a corner moves in some steps because its rectangle turns (m)."""
     half = 0.5 * (actor.heading[steps + 1] - actor.heading[steps])
     return np.asarray(np.abs(np.sin(half)) * math.hypot(actor.length, actor.width))
 

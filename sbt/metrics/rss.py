@@ -117,8 +117,9 @@ def _relation(one: ActorTrace, two: ActorTrace) -> _Relation:
     found = [_relation_of(a, b) for a, b in part_pairs(one, two)]
     if len(found) == 1:
         return found[0]
-    apart = np.stack([np.maximum(r.gap, r.clearance) for r in found])  # (pairs, t)
-    nearest = np.where(np.isnan(apart), np.inf, apart).argmin(axis=0)
+    gap, clearance = (np.stack([getattr(r, name) for r in found]) for name in ("gap", "clearance"))  # (pairs, t)
+    apart = np.nan_to_num(np.hypot(np.maximum(gap, 0.0), np.maximum(clearance, 0.0)), nan=np.inf)
+    nearest = np.where(apart <= apart.min(axis=0) + _TOUCH, gap, np.inf).argmin(axis=0)  # of several the one that is most level
     rows = np.arange(len(nearest))
     fields = ("gap", "clearance", "ahead", "left", "turn")
     return _Relation(*(np.stack([getattr(r, name) for r in found])[nearest, rows] for name in fields))
