@@ -40,7 +40,7 @@ __all__ = ["PERSON_SIZE", "Recording", "catalogue", "encounters", "near_pairs", 
 PERSON_SIZE = (0.215, 0.478)
 """Length and width of a person whose size is not in the file (m): SUMO's default pedestrian."""
 _ABLE, _INEXACT, _RARE, _FEW = 10.0, 1.0, 0.01, 2
-"""Who is farther ahead than by such accelerations (m/s^2), and this far (m), was teleported: in this share of its steps or few."""
+"""Who is farther ahead than by such accelerations (m/s^2), and this far (m), was teleported: in this share of steps, or few."""
 _COLUMNS = ("time", "x", "y", "angle", "speed", "acceleration", "length", "width", "z", "slope")
 _REQUIRED = ("time", "id", "x", "y", "angle", "speed")
 _KINDS = ("vehicle", "person")
