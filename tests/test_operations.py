@@ -233,6 +233,13 @@ def test_files_of_other_scenarios_of_the_session_end_no_campaign(tmp_path: Path)
 
 
 @pytest.mark.sumo
+def test_networks_that_runs_write_themselves_end_no_campaign(tmp_path: Path):
+    write_traffic(tmp_path)
+    (tmp_path / "own.py").write_text(WRITTEN)
+    assert rows_with(f"{tmp_path / 'own.py'}:S", {"kind": "serial"}, lambda: None) == 24
+
+
+@pytest.mark.sumo
 @pytest.mark.parametrize("executor", EXECUTORS)
 @pytest.mark.parametrize("moved", [False, True])
 def test_a_link_is_what_it_leads_to(tmp_path: Path, executor: dict[str, object], moved: bool):
@@ -267,6 +274,19 @@ def test_a_large_file_is_what_is_in_it(tmp_path: Path, executor: dict[str, objec
         assert rows_with(str(tmp_path / "scenario.yaml"), executor, traffic.touch) == 24
 
 
+WRITTEN = """import pathlib
+import sbt
+from sbt.sumo.nets import net_file
+
+
+def evaluate(values, seed):
+    path = pathlib.Path(__file__).with_name("built.net.xml")
+    path.write_text(path.with_name("a.net.xml").read_text().replace("900", str(800 + values["a"])))
+    return {"y": float(len(net_file(str(path)).read_text()))}
+
+
+S = sbt.Scenario("own", [sbt.Parameter("a", 0, 99, kind="integer")], sbt.Requirement("y", high=0.1), evaluate=evaluate)
+"""
 SCENE = """import sbt
 from sbt.metrics.planar import distance_min
 from sbt.problem.scenario import LogicalScenario

@@ -133,8 +133,7 @@ class SummingStage:
     @cached_property
     def _crowded(self) -> bool:
         """Whether a run of each combination takes so much of the budget that the sum is worse than random draws, if noisy."""
-        budget = self.settings.budget
-        return _shares(self._points[1], budget - WANTED) > _WORSE / budget
+        return _is_crowded(self._points[1], self.settings.budget)
 
     @cached_property
     def _likely(self) -> int:
@@ -193,8 +192,7 @@ class SummingStage:
         They do not count, and are compared with each other alone: a decision by what counts would bias the estimate.
         """
         x, s = self._points[0], self.settings
-        n = min(_EARLY, s.budget - len(x) - WANTED)
-        return (PlannedRun(REPEAT, s.scenario.space.named(x[0])),) * n if log.iteration == 1 and self._crowded and n > 1 else ()
+        return (PlannedRun(REPEAT, s.scenario.space.named(x[0])),) * _EARLY if log.iteration == 1 and self._crowded else ()
 
     def _again(self, log: Log, most: int) -> tuple[PlannedRun, ...]:
         """Return up to `most` repeats that tell of noise; early ones that found none say little of other combinations."""
@@ -214,10 +212,14 @@ class SummingStage:
 def sums(settings: Settings) -> bool:
     """Return whether every combination of the inputs can be run within the budget, and repeats that tell of noise.
 
-    Not with correlated inputs: the probabilities of their combinations have no closed form.
+    That takes four early ones more where the sum may be worse than random draws. Not with correlated inputs: the probabilities of
+    their combinations have no closed form.
     """
     found = None if settings.scenario.space.correlation is not None else _combinations(settings.scenario.space)
-    return found is not None and len(found[0]) + WANTED <= settings.budget
+    if found is None:
+        return False
+    room = settings.budget - len(found[0]) - WANTED
+    return room >= (_EARLY if room >= 0 and _is_crowded(found[1], settings.budget) else 0)
 
 
 def took_sum(log: Log) -> bool:
@@ -321,6 +323,11 @@ def _noise_decides(log: Log, settings: Settings) -> bool:
     y = settings.scenario.requirement.told(log.history)[log.history.stage == COMBINATION]
     y = y[np.isfinite(y)]
     return len(y) == 0 or (noise.std or 0.0) >= _HIDES * float(np.abs(y - np.median(y)).mean())
+
+
+def _is_crowded(p: Vector, budget: int) -> bool:
+    """Return whether a run of each combination takes so much of the budget that the sum is worse than random draws, if noisy."""
+    return _shares(p, budget - WANTED) > _WORSE / budget
 
 
 def _shares(p: Vector, n: int) -> float:

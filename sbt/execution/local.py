@@ -296,15 +296,15 @@ def settle() -> None:
 def _scenario(folder: str, level: int = 0) -> LogicalScenario:
     """Return the scenario that the driver wrote for its workers, at a level of fidelity."""
     spec, timeout = pickle.loads(Path(folder, _SCENARIO).read_bytes())
-    scenario: LogicalScenario = spec.at_level(level).resolve()
-    prepare(scenario)
+    with _loaded_anew(folder).collected():
+        scenario: LogicalScenario = spec.at_level(level).resolve()
+        prepare(scenario)
     return scenario.limited(timeout)
 
 
 def _prepare(folder: str, workers: int) -> Mapping[str, str]:
     """Load the scenario in a worker, and wait until every worker does; return what is in the files that it read."""
-    with _loaded_anew(folder).unchanged():
-        _scenario(folder)
+    _scenario(folder)
     settle()
     _limit_memory(folder)
     _mark(folder, ())
@@ -323,8 +323,8 @@ def _loaded_anew(folder: str) -> LoadedAnew:
 
 def _run_chunk(folder: str, jobs: list[Job]) -> list[Outcome]:
     """Run jobs in a worker and record which are in progress."""
-    with _loaded_anew(folder).unchanged():
-        outcomes = run_at_levels(partial(_scenario, folder), jobs, partial(_mark, folder))
+    outcomes = run_at_levels(partial(_scenario, folder), jobs, partial(_mark, folder))
+    _loaded_anew(folder).check()
     for outcome in outcomes if _limit(folder) else ():
         if outcome.reason.startswith(_TOO_LARGE):  # what earlier runs left may be to blame: tried again alone, as after a death
             _mark(folder, (outcome.index,))

@@ -89,13 +89,13 @@ class SerialExecutor:
 
     def __init__(self, spec: ScenarioSpec, timeout: float | None = None):
         self._files = LoadedAnew()
-        with self._files.unchanged():
+        with self._files.collected():
             self._scenarios = tuple(level.resolve().limited(timeout) for level in spec.levels)
 
     def __enter__(self) -> Self:
         """Let the scenario load what is slow to load."""
         open_missing()
-        with self._files.unchanged():
+        with self._files.collected():
             for scenario in self._scenarios:
                 prepare(scenario)
         return self
@@ -119,10 +119,10 @@ class SerialExecutor:
         while queue:
             simulate = self._scenarios[queue[0].level].simulate
             together = isinstance(simulate, Batched) and simulate.batched
-            with self._files.unchanged():
-                with interruption.handled():  # which tells Ctrl-C from a KeyboardInterrupt that the scenario's code raises
-                    outcomes = self._together(queue) if together else self._alone(queue)
-                _restore(place, depth)
+            with interruption.handled():  # which tells Ctrl-C from a KeyboardInterrupt that the scenario's code raises
+                outcomes = self._together(queue) if together else self._alone(queue)
+            _restore(place, depth)
+            self._files.check()
             yield outcomes
 
     def _together(self, queue: deque[Job]) -> list[Outcome]:

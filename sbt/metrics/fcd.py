@@ -167,9 +167,11 @@ def recording_of_columns(path: Path, ids: Any, kinds: Any, columns: dict[str, An
     heading = np.radians(90.0 - data["angle"])
     half = 0.5 * lengths[user]
     x, y = data["x"] - half * np.cos(heading), data["y"] - half * np.sin(heading)
-    goes_on = _goes_on(user, step, time[step], (x, y, heading, data["speed"]))
+    goes_on = _goes_on(user, step, time[step], (x, y, heading, data["speed"]), person)
     acceleration = _differences(data["speed"], time[step], goes_on)
-    acceleration = np.where(np.isnan(data["acceleration"]), acceleration, data["acceleration"])
+    unknown = np.isnan(data["acceleration"])
+    unknown[1:] |= goes_on & _is_long(np.diff(time[step]), goes_on)  # what is in the file is that of its end
+    acceleration = np.where(unknown, acceleration, data["acceleration"])
     z, slope = (data.get(name, np.full(len(order), np.nan)) for name in ("z", "slope"))
     flat = bool(np.isnan(z).all())
     rise = np.tan(np.radians(np.nan_to_num(slope)))
@@ -192,7 +194,15 @@ def _check_metres(path: Path, data: dict[str, Vector], user: Integers) -> None:
         )
 
 
-def _goes_on(user: Integers, step: Integers, time: Vector, states: tuple[Vector, Vector, Vector, Vector]) -> Mask:
+def _is_long(elapsed: Vector, goes_on: Mask) -> Mask:
+    """Return (n - 1,) which steps are half as long again as most, or longer."""
+    usual = float(np.median(elapsed[goes_on])) if goes_on.any() else 0.0
+    return elapsed > 1.5 * usual
+
+
+def _goes_on(
+    user: Integers, step: Integers, time: Vector, states: tuple[Vector, Vector, Vector, Vector], person: Mask
+) -> Mask:
     """Return (n - 1,) whether rows are followed by one of the same road user, at the next step, that it may have driven to.
 
     Else it was away, or was teleported: farther ahead than by its speeds, if these are those of its positions elsewhere.
@@ -202,6 +212,7 @@ def _goes_on(user: Integers, step: Integers, time: Vector, states: tuple[Vector,
         step: (n,) of each row, sorted of each user.
         time: (n,) s.
         states: (n,) x, y (m), heading (rad) and speed (m/s).
+        person: (m,) of each road user, whether it is one: SUMO puts persons onto crossings and off them.
     """
     x, y, heading, speed = states
     elapsed, dx, dy = np.diff(time), np.diff(x), np.diff(y)
@@ -211,8 +222,8 @@ def _goes_on(user: Integers, step: Integers, time: Vector, states: tuple[Vector,
     begin, change = speed[:-1], _ABLE * elapsed
     end = np.clip(speed[1:], begin - change, begin + change)
     peak = 0.5 * (begin + end + change)  # who accelerates as long as it can, and brakes then, is farthest
-    explained = driven & (ahead <= (2.0 * peak**2 - begin**2 - end**2) / (2.0 * _ABLE) + _INEXACT)
     of = user[:-1]
+    explained = driven & (person[of] | (ahead <= (2.0 * peak**2 - begin**2 - end**2) / (2.0 * _ABLE) + _INEXACT))
     steps, teleports = (np.bincount(of[rows], minlength=user[-1] + 1) for rows in (driven, driven & ~explained))
     return driven & (explained | (teleports > np.maximum(_RARE * steps, _FEW))[of])
 

@@ -133,20 +133,27 @@ def contents_read() -> dict[str, str]:
 
 
 class LoadedAnew:
-    """The files of a campaign that SUMO loads in every run, each as it was when the campaign first read it."""
+    """The files of a campaign that SUMO loads in every run, each as it was when the campaign first read it.
+
+    Files that runs read, and may write, are none of them.
+    """
 
     def __init__(self) -> None:
         self._begun: dict[Path, tuple[tuple[int, int], str]] = {}
 
     @contextmanager
-    def unchanged(self) -> Iterator[None]:
-        """Let the campaign prepare its runs, or make some, and check that the files are what they were.
+    def collected(self) -> Iterator[None]:
+        """Let the campaign resolve or prepare its scenario, and remember what is read for it."""
+        with _collected() as files:
+            yield
+        self._begun |= {path: (_stamp(path), _content(path)) for path in files - self._begun.keys()}
+
+    def check(self) -> None:
+        """Check that the files are what they were.
 
         Raises:
             InputError: one has changed, or is not there any more.
         """
-        with _collected() as files:
-            yield
         known = self._begun.items()
         changed = {path for path, (stamp, was) in known if _stamp(path) != stamp and _content(path) != was}
         if changed:
@@ -154,7 +161,6 @@ class LoadedAnew:
             linked = {path.resolve() for path in changed if path.resolve() != path}
             told = ", ".join(sorted(map(str, changed - linked)))
             raise InputError(f"{rule}, but changed: {told}; put it back and run again, or choose another store")
-        self._begun |= {path: (_stamp(path), _content(path)) for path in files - self._begun.keys()}
 
 
 def _print(path: Path) -> str:
