@@ -370,14 +370,19 @@ def test_the_budget_is_kept(tmp_path: Path, scenario: str, budget: int, cost: fl
     assert budget - 2.0 < spent <= budget + 1e-9
 
 
-def test_where_coarse_runs_tell_nothing_but_inputs_do_these_draw_the_rest(tmp_path: Path) -> None:
-    (tmp_path / "own.py").write_text(
+def write_levels(folder: Path, metric: str) -> None:
+    """Write two scenarios of one input whose metric, of `values`, `seed` and `name`, has noise of its own in each."""
+    (folder / "own.py").write_text(
         "import sbt\nfrom sbt.seeds import stream\n"
         "def scenario(name):\n"
         "    return sbt.Scenario(name, inputs=[sbt.Parameter('a', 0, 1)], requirement=sbt.Requirement('y', high=0.2),\n"
-        "        evaluate=lambda values, seed: {'y': values['a'] + 0.1 * float(stream(seed, name).normal())})\n"
+        f"        evaluate=lambda values, seed: {{'y': {metric}}})\n"
         "FINE, COARSE = scenario('fine'), scenario('coarse')\n"
     )
+
+
+def test_where_coarse_runs_tell_nothing_but_inputs_do_these_draw_the_rest(tmp_path: Path) -> None:
+    write_levels(tmp_path, "values['a'] + 0.1 * float(stream(seed, name).normal())")
     own = {**NOISY, "scenario": str(tmp_path / "own.py:FINE"), "budget": 200}
     summary = run(tmp_path / "told", own, fidelity={"scenario": str(tmp_path / "own.py:COARSE"), "cost": 0.5})
     told = summary.conclusion
@@ -391,13 +396,7 @@ def test_where_coarse_runs_tell_nothing_but_inputs_do_these_draw_the_rest(tmp_pa
 
 def test_where_coarse_runs_tell_nothing_the_rest_is_crude_monte_carlo(tmp_path: Path) -> None:
     """And where nothing critical is met, hardly a run is spent on what a belief promises."""
-    (tmp_path / "own.py").write_text(
-        "import sbt\nfrom sbt.seeds import stream\n"
-        "def scenario(name):\n"
-        "    return sbt.Scenario(name, inputs=[sbt.Parameter('a', 0, 1)], requirement=sbt.Requirement('y', high=0.2),\n"
-        "        evaluate=lambda values, seed: {'y': float(stream(seed, name).random())})\n"
-        "FINE, COARSE = scenario('fine'), scenario('coarse')\n"
-    )
+    write_levels(tmp_path, "float(stream(seed, name).random())")
     own = {**NOISY, "scenario": str(tmp_path / "own.py:FINE"), "budget": 100}
     summary = run(tmp_path / "unlike", own, fidelity={"scenario": str(tmp_path / "own.py:COARSE"), "cost": 0.2})
     told = summary.conclusion.to_dict()

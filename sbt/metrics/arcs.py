@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -57,15 +56,14 @@ def is_coarse(step: float) -> bool:
     return step > _SHORT + 1e-9
 
 
-def parts_of_turns(actors: Sequence[ActorTrace], step: float) -> int:
-    """Return into how many parts steps (s) are divided so that no corner of the actors swings far in one; a power of two.
+def parts_of_turns(actor: ActorTrace, step: float) -> int:
+    """Return into how many parts steps (s) are divided so that no corner of a rectangle swings far in one; a power of two.
 
     Persons are small, and SUMO turns them at once.
     """
-    if not is_coarse(step):
+    if not is_coarse(step) or is_person(actor):
         return 1
-    bodies = (part for actor in actors for part in actor.parts or (actor,) if not is_person(part))
-    return parts_of_swing(max(map(_swing, bodies), default=0.0))
+    return parts_of_swing(float(np.fmax.reduce(swings(actor), initial=0.0)))
 
 
 def parts_of_swing(swing: float) -> int:
@@ -83,11 +81,6 @@ def while_passing(a: ActorTrace, b: ActorTrace, where: Mask) -> tuple[ActorTrace
     parts = min(math.ceil(float(way[steps].max(initial=0.0)) / far), _MOST_PASSING)
     step, share = np.repeat(steps, max(parts - 1, 0)), np.tile(np.arange(1, parts) / max(parts, 1), len(steps))
     return after_shares(a, step, share), after_shares(b, step, share)
-
-
-def _swing(actor: ActorTrace) -> float:
-    """Return by how much (m) a corner moves, at most, because its rectangle turns within a step."""
-    return float(np.fmax.reduce(swings(actor), initial=0.0))
 
 
 def swings(actor: ActorTrace) -> Vector:

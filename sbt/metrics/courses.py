@@ -80,7 +80,7 @@ class Course:
 
     @cached_property
     def _parts(self) -> int:
-        return parts_of_turns([self._points], self.step)
+        return parts_of_turns(self._points, self.step)
 
     @cached_property
     def _path(self) -> ActorTrace:

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from sbt.metrics.arcs import on_arcs
+from sbt.metrics.arcs import on_arcs, swings
 from sbt.metrics.discs import discs_of
 from sbt.metrics.geometry import part_pairs, rectangle_distance, select_instants
 from sbt.problem.arrays import Mask, Vector
@@ -60,7 +60,7 @@ def _least_of_rectangles(a: ActorTrace, b: ActorTrace, least: float) -> float:
         steps = steps[_bound(a, b, steps, distance) < least - _EXACT]
     if not steps.size:
         return least
-    found, turned = _within(a, b, steps, bend=False), np.maximum(_turned(a, steps), _turned(b, steps)) > _TURNED
+    found, turned = _within(a, b, steps, bend=False), np.maximum(swings(a)[steps], swings(b)[steps]) > _TURNED
     if turned.any() and discs_of(a, b) is None:  # two persons are discs, which SUMO turns at once
         found[turned] = np.maximum(found[turned], _within(a, b, steps[turned], bend=True))
     return float(np.fmin.reduce(found, initial=least))
@@ -97,12 +97,6 @@ def _met(begin: Vector, end: Vector, falls: Vector, rises: Vector) -> Vector:
         at = np.clip((begin - end + rises) / (falls + rises), 0.0, 1.0)
     inside = ~((falls <= 0.0) | (rises <= 0.0))
     return np.where(inside, begin - falls * at, np.minimum(begin, end))
-
-
-def _turned(actor: ActorTrace, steps: np.ndarray) -> Vector:
-    """Return (n,) how far a corner moves in some steps because its rectangle turns (m)."""
-    half = 0.5 * (actor.heading[steps + 1] - actor.heading[steps])
-    return np.asarray(np.abs(np.sin(half)) * math.hypot(actor.length, actor.width))
 
 
 def _within(a: ActorTrace, b: ActorTrace, steps: np.ndarray, *, bend: bool) -> Vector:
