@@ -13,7 +13,6 @@ from sbt.metamodels.automatic import Auto
 from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.metamodels.noise_shape import shaped
 from sbt.metamodels.prediction import Prediction
-from sbt.metamodels.rated import better_rate
 from sbt.metamodels.saturation import Opened
 from sbt.metamodels.stacking import Bins
 from sbt.metamodels.warped import better_warp
@@ -110,12 +109,16 @@ def test_a_boundary_of_a_coin_says_that_it_knows_nothing(tmp_path: Path):
 
     inputs = [sbt.Parameter("a", 0.0, 1.0), sbt.Parameter("b", 0.0, 1.0)]
     scenario = sbt.Scenario("coin", inputs, sbt.Requirement("y", high=0.0), evaluate=coin)
-    result = sbt.run(
-        campaign="boundary", scenario=scenario, budget=60, seed=1, executor="serial", store=tmp_path / "store", report=False,
-    )  # fmt: skip
-    found = result.conclusion.to_dict()
-    assert 0.3 < found["critical_fraction"] < 0.7
-    assert found["expected_misclassified"] > 0.3
+    wrong = []
+    for seed in (1, 2):  # .68 and .55 of the runs are critical by chance
+        result = sbt.run(
+            campaign="boundary", scenario=scenario, budget=60, seed=seed, executor="serial", store=tmp_path / f"{seed}",
+            report=False,
+        )  # fmt: skip
+        found = result.conclusion.to_dict()
+        assert found["critical_fraction"] == pytest.approx(result.frame["critical"].mean(), abs=0.06)
+        wrong.append(found["expected_misclassified"])
+    assert np.mean(wrong) > 0.3
 
 
 def test_where_noise_decides_the_space_is_filled(tmp_path: Path):
@@ -164,13 +167,3 @@ def test_of_a_flag_that_chance_decides_the_rate_is_learned(critical: CriticalInt
         assert np.isfinite(paths).all()
     assert np.mean(errors) < 0.1
     assert np.mean(shares) == pytest.approx(0.25, abs=0.05)
-
-
-def test_a_flag_without_noise_is_learned_by_its_sides():
-    u = repeated(1)
-    y = np.where(disc(u) <= 0.0, -1.0, 1.0)
-    assert better_rate(PROCESS, np.zeros(len(u)), LOW, u, y, stream(0, "fit")) is None
-    flipped = np.where(np.arange(len(y)) == len(y) - 1, -y, y)  # the same input, the other value
-    rated = better_rate(PROCESS, np.full(len(u), np.log(0.5)), LOW, u, flipped, stream(0, "fit"))
-    assert rated is not None
-    assert rated[1].mean() > 0.0

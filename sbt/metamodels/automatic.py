@@ -17,7 +17,7 @@ from sbt.metamodels.base import (
     Predictor,
     Screened,
     check_rows,
-    is_rate,
+    is_flag,
     once,
     sample_paths,
     sketched,
@@ -26,12 +26,12 @@ from sbt.metamodels.base import (
 from sbt.metamodels.censored import Limit, beyond
 from sbt.metamodels.deep_ensemble import Ensemble
 from sbt.metamodels.extra_trees import ExtraTrees
+from sbt.metamodels.flags import flag_process
 from sbt.metamodels.gaps import better_without_gap
 from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.metamodels.labelled import better_labelled
 from sbt.metamodels.noise_shape import better_uneven, shaped
 from sbt.metamodels.prediction import Prediction
-from sbt.metamodels.rated import better_rate
 from sbt.metamodels.rounded import Rounding, better_rounded, without_unit
 from sbt.metamodels.sided import better_sided
 from sbt.metamodels.stacking import Bins, cell_shares, held_out_scores, is_surely_better, mixture_score, stacking_weights
@@ -69,7 +69,7 @@ class Auto:
     nu 2.5 and one noise, is taken alone unless the mixture is better by three standard errors, and better over the space, too
     (rows crowd at the edge, where a mixture that hedges looks better than it is). Where the metric jumps at the edge, `gp`
     learns a widened jump if that predicts the sides better (see `stepped`); of a noisy one, noise that depends on the inputs
-    (`noise_shape`), the rate of two values (`rated`), or beside other values how often runs are critical (`labelled`). Where it
+    (`noise_shape`), or beside the values how often runs are critical (`labelled`); of two values, labels (`flags`). Where it
     leaves next to nothing to gain, the others are not even tried.
 
     Args:
@@ -152,23 +152,9 @@ class Auto:
     ) -> MixturePredictor:
         """Return the process alone, or the mixture where it is better for where the runs fell, at the edge and over the space."""
         n, models = len(y), self._models(len(y), len(y), target_aware=True)
-        bins = replace(bins, near=np.inf) if told is not None or is_rate(u, y) else bins  # nor do ranges between two steps
-        plain, shares = self.simplest.fit(u, y, rng), cell_shares(u, rng)
-        stepped = better_stepped(self.simplest, plain, bins.critical, u, y, shares, rng)
-        even = plain if stepped is not None else better_uneven(self.simplest, plain, bins.critical, u, y, shares, rng) or plain
-        values = (shaped(even, u, y, bins.critical, rng) or even) if stepped is None else stepped
-        own = stepped.log_score(bins, u, y) if stepped is not None else bins.log_score(values.leave_one_out(u, y), y)
-        sided = better_sided(self.simplest, values, bins.critical, u, y, shares, rng)
-        own = own if sided is None else own + sided[1]
-        rated = better_rate(self.simplest, own, bins.critical, u, y, rng)
-        process: Predictor = rated[0] if rated is not None else values if sided is None else sided[0]
-        own = own if rated is None else own + rated[1]
-        labelled = better_labelled(self.simplest, values, bins.critical, u, y, shares, rng)
-        if labelled is not None:  # of ranges beside the edge labels tell nothing
-            (process, own), bins = labelled, replace(bins, near=np.inf)
-        rounded = None if told is None else better_rounded(told, own, bins.critical, u, y, bins.warp, shares, rng)
-        process = process if rounded is None else rounded[0]
-        own = own if rounded is None else own + rounded[1]
+        flag = flag_process(bins.critical, u, y, rng) if bins.critical.one_sided and is_flag(y, bins.critical) else None
+        bins = replace(bins, near=np.inf) if told is not None or flag else bins  # no ranges between two steps
+        process, own, bins, shares = (*flag, bins, cell_shares(u, rng)) if flag else self._process_at_edge(u, y, rng, bins, told)
         if max(-float(own.mean()), -float(shares @ own)) < _WORTH:
             missed = max(-float(own.mean()), _NOTHING)
             left = f"of {n} rows, each predicted from all others, {missed:.1g}: others could add no more"
@@ -184,6 +170,26 @@ class Auto:
         weights = stacking_weights(scores, self.prior, 0.5 + 0.5 * len(rows) * shares / shares.sum())
         comparison = _explain(list(models), weights, scores, len(rows), self, bins, shares)
         return self._mixed(models, {"gp": process}, comparison, u, y, rng)
+
+    def _process_at_edge(
+        self, u: Points, y: Vector, rng: np.random.Generator, bins: Bins, told: Rounding | None
+    ) -> tuple[Predictor, Vector, Bins, Vector]:
+        """Return a process that knows the edge, the score of each row by all others, what is scored, and shares of the space."""
+        plain, shares = self.simplest.fit(u, y, rng), cell_shares(u, rng)
+        stepped = better_stepped(self.simplest, plain, bins.critical, u, y, shares, rng)
+        even = plain if stepped is not None else better_uneven(self.simplest, plain, bins.critical, u, y, shares, rng) or plain
+        values = (shaped(even, u, y, bins.critical, rng) or even) if stepped is None else stepped
+        own = stepped.log_score(bins, u, y) if stepped is not None else bins.log_score(values.leave_one_out(u, y), y)
+        sided = better_sided(self.simplest, values, bins.critical, u, y, shares, rng)
+        own = own if sided is None else own + sided[1]
+        process: Predictor = values if sided is None else sided[0]
+        labelled = better_labelled(self.simplest, values, bins.critical, u, y, shares, rng)
+        if labelled is not None:  # of ranges beside the edge labels tell nothing
+            (process, own), bins = labelled, replace(bins, near=np.inf)
+        rounded = None if told is None else better_rounded(told, own, bins.critical, u, y, bins.warp, shares, rng)
+        process = process if rounded is None else rounded[0]
+        own = own if rounded is None else own + rounded[1]
+        return process, own, bins, shares
 
     def _mixed(
         self, models: Mapping[str, Metamodel], fitted: Mapping[str, Predictor], comparison: ModelComparison, u: Points, y: Vector,

@@ -39,7 +39,7 @@ from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
 __all__ = [
-    "Metamodel", "Predictor", "Screened", "TargetAware", "build", "call", "check_rows", "fitted", "gives_different", "is_rate",
+    "Metamodel", "Predictor", "Screened", "TargetAware", "build", "call", "check_rows", "fitted", "gives_different", "is_flag",
     "log_ambiguity_bound", "named_errors", "once", "predicted", "sample_paths", "simplest", "sketched", "split_validation",
     "standardise", "with_target", "without_repetitions",
 ]  # fmt: skip
@@ -343,9 +343,10 @@ def gives_different(u: Points, y: Vector) -> bool:
     return not np.allclose(y, y[first][group.reshape(-1)], rtol=1e-9, atol=0.0)
 
 
-def is_rate(u: Points, y: Vector) -> bool:
-    """Say whether y (n,) has two values, and both at equal rows of u (n, d): what is learned is how often it has the one."""
-    return len(np.unique(y)) == 2 and gives_different(u, y)
+def is_flag(y: Vector, critical: CriticalInterval) -> bool:
+    """Say whether y (n,) has two values, one in M_c and one not: which side of it a run fell on is all that is told."""
+    two = np.unique(y)
+    return len(two) == 2 and int(critical.contains(two).sum()) == 1
 
 
 def standardise(y: Vector) -> tuple[Vector, float, float]:

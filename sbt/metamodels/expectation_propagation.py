@@ -144,8 +144,8 @@ def believe(
             + 0.5 * float((shift * middle).sum() - (shift**2 / (rest + precision)).sum())
             + 0.5 * float((beside * rest * (precision * beside - 2.0 * shift) / (rest + precision)).sum())
         )
-        if abs(log_evidence - before) < _CLOSE:
-            break
+        if abs(log_evidence - before) < _CLOSE or k == _SWEEPS - 1:
+            break  # factor and Gaussians belong together
         before, about = log_evidence, beside + up / rest
         narrowed = np.maximum(1.0 / rest - bent / rest**2, 1e-12)
         found, aim = np.maximum(1.0 / narrowed - rest, 1e-10), about / narrowed - beside * rest

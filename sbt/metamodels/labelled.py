@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import ndtri
 from scipy.stats import normaltest
 
-from sbt.metamodels.base import gives_different, is_rate
+from sbt.metamodels.base import gives_different
 from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.metamodels.gp_predictor import GaussianProcessPredictor
 from sbt.metamodels.noise_shape import ShapedPredictor
@@ -91,7 +91,7 @@ def better_labelled(
     """Return a mean of labels and values, and (n,) log P(side) of left-out rows by it; None where there is no use for labels.
 
     Only where equal rows differ, and left-out errors of the values are not Gaussian: of Gaussian noise a process of the values
-    knows more. A flag has a rate of its own (`rated`). The weights are those by which left-out sides are likeliest, rows and
+    knows more. A flag has labels alone (`flags`). The weights are those by which left-out sides are likeliest, rows and
     space counting the same; few rows say too little to choose one of both.
 
     Args:
@@ -104,7 +104,7 @@ def better_labelled(
         rng: the only source of randomness.
     """
     hit = critical.contains(y)
-    if not critical.one_sided or len(y) < _FEWEST or not hit.any() or hit.all() or is_rate(u, y) or not gives_different(u, y):
+    if not critical.one_sided or len(y) < _FEWEST or not hit.any() or hit.all() or not gives_different(u, y):
         return None
     if _gaussian(values, u, y):
         return None

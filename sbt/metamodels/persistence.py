@@ -22,9 +22,10 @@ from sbt.errors import InputError
 from sbt.files import write_atomically
 from sbt.metamodels import automatic as auto
 from sbt.metamodels import bayesian_network as bnn
-from sbt.metamodels import deep_ensemble as ensemble
 from sbt.metamodels import (
+    classifier,
     expectation_propagation,
+    flags,
     gp_algebra,
     gp_predictor,
     joint,
@@ -32,7 +33,6 @@ from sbt.metamodels import (
     noise_shape,
     over_traffic,
     prediction,
-    rated,
     recalibrated,
     rounded,
     saturation,
@@ -42,6 +42,7 @@ from sbt.metamodels import (
     warp,
     warped,
 )
+from sbt.metamodels import deep_ensemble as ensemble
 from sbt.metamodels import extra_trees as et
 from sbt.metamodels.base import Predictor
 from sbt.metamodels.torch_tools import device_of
@@ -70,8 +71,9 @@ _KINDS: dict[str, Any] = {
         joint.JointPredictor,
         expectation_propagation.Belief,
         expectation_propagation.Hyper,
+        classifier.Classifier,
         labelled.LabelledPredictor,
-        rated.RatePredictor,
+        flags.FlagPredictor,
         rounded.RoundedPredictor,
         recalibrated.RecalibratedPredictor,
         saturation.Ending,

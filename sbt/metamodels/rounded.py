@@ -38,7 +38,7 @@ _LENGTH, _NOISE = 0.3, 0.03
 _BOUNDS = ((-3.5, 4.0), (-4.0, 3.0), (-30.0, 30.0), (math.log(1e-3), 1.0))
 """Of log lengths, log spread, mean and log noise, in standard deviations of y."""
 _SURE, _SURELY_WORSE = 1.0, 2.0
-"""Standard errors by which left-out runs must be predicted better, of a flag or with noise, and otherwise may not be worse."""
+"""Standard errors by which left-out runs must be predicted better where there is noise, and otherwise may not be worse."""
 _AT_EDGE = 1e-9
 """Standard deviations of y, within which the edge is reached."""
 
@@ -214,8 +214,8 @@ def better_rounded(
     belief = believe(hyper, hyper.covariance(u[rows])[0], low[rows], high[rows])
     found = RoundedPredictor(u[rows], hyper, belief, scale, told.edge, told.width, critical, warp)
     gain = found.log_sides(u, inside, rows) - score
-    others = len(np.unique(told.low)) == 2 or gives_different(u, y)  # learn sides, or how often there is noise, as well
-    better = surely_positive(gain, _SURE) and float(shares @ gain) > 0.0 if others else not surely_positive(-gain, _SURELY_WORSE)
+    noisy = gives_different(u, y)  # of which others learn how often, as well
+    better = surely_positive(gain, _SURE) and float(shares @ gain) > 0.0 if noisy else not surely_positive(-gain, _SURELY_WORSE)
     return (found, gain) if better else None
 
 

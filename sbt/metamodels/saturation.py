@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.distance import cdist
 from scipy.special import log_ndtr
 
-from sbt.metamodels.base import Metamodel, Predictor, Screened, fitted, is_rate, sample_paths, sketched, with_target
+from sbt.metamodels.base import Metamodel, Predictor, Screened, fitted, is_flag, sample_paths, sketched, with_target
 from sbt.metamodels.censored import Limit, beyond
 from sbt.metamodels.prediction import Prediction, Scale, reached_beyond
 from sbt.metamodels.rounded import StepAware, rounding
@@ -89,7 +89,9 @@ def opened_and_limit(u: Points, y: Vector, critical: CriticalInterval, rng: np.r
         return moved, _limit(u, y, moved, critical)
     margin = critical.margin(y)
     tied = margin == 0.0
-    if tied.sum() < _FEWEST or (margin < 0.0).any() or is_rate(u, y):
+    if is_flag(y, critical):
+        return centred(u, y, critical), None
+    if tied.sum() < _FEWEST or (margin < 0.0).any():
         y = centred(u, y, critical)
         moved = _opened_outside(u, _opened_inside(u, y, critical, rng), critical, rng)
     else:
@@ -324,9 +326,8 @@ def _scale(
     u: Points, y: Vector, critical: CriticalInterval, steps: tuple[tuple[float, float], ...], limit: Limit | None
 ) -> Scale | None:
     """Return which values the metric has, as far as its runs tell; None: any."""
-    two = np.unique(y).tolist()
-    if len(two) == 2 and critical.contains(np.array(two)).sum() == 1:
-        return Scale(two[0], two[1], flag=critical)
+    if is_flag(y, critical):
+        return Scale(float(y.min()), float(y.max()), flag=critical)
     low, high = _last(u, y, y.min(), -np.inf), _last(u, y, y.max(), np.inf)
     if limit is not None:  # what was moved beyond the last value
         low, high = y.min() if limit.at_most.any() else low, high if limit.at_most.all() else y.max()

@@ -116,7 +116,7 @@ def better_sided(
     """
     hit = critical.contains(y)
     few = min(int(hit.sum()), int((~hit).sum())) < _FEWEST
-    if few or len(y) > _MOST or not jumps(y, critical) or gives_different(u, y):
+    if few or len(y) > _MOST or gives_different(u, y) or not jumps(y, critical, lambda: values.leave_one_out(u, y)):
         return None
     plain = values if isinstance(values, GaussianProcessPredictor) else values.process
     longest = plain.hyper.lengthscale[int(np.argmax(plain.hyper.outputscale))]

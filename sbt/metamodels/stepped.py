@@ -8,6 +8,7 @@ from the edge, and P(critical) is asked of the moved values.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +27,8 @@ _FEWEST = 4  # runs of equal value next to the edge: a floor
 _EQUAL = 1e-6  # of the range
 _GAP = 0.2  # of the standard deviation of y between the nearest values on both sides: more than chance leaves
 _FEWEST_BESIDE = 5  # runs on each side, from which on a gap tells anything
+_EXACT = 0.01  # of the standard deviation of y: a process that predicts all rows near the edge so well goes through it
+_NEAR = 2.0  # gaps, at least those that tell of a jump, from the edge
 _FEWEST_HITS = 1  # with none, the surest "no" is the best
 _SURE = 3.0  # standard errors
 _INSIDE = 1e-3  # slope of the way back within the jump
@@ -126,7 +129,7 @@ def better_stepped(
         shares: (n,) of the space that each row stands for.
         rng: the only source of randomness.
     """
-    if not jumps(y, critical):
+    if not jumps(y, critical, lambda: process.leave_one_out(u, y)):
         return None
     plain, best, found = side_score(process.leave_one_out(u, y), y, critical), 0.0, None
     for width in _HALF_WIDTHS:
@@ -145,16 +148,23 @@ def side_score(prediction: Prediction, y: Vector, critical: CriticalInterval) ->
     return np.where(critical.contains(y), inside, outside)
 
 
-def jumps(y: Vector, critical: CriticalInterval) -> bool:
-    """Say whether y (n,) seems to jump at the only end of the critical interval: a floor at it, or a gap."""
+def jumps(y: Vector, critical: CriticalInterval, left_out: Callable[[], Prediction] | None = None) -> bool:
+    """Say whether y (n,) seems to jump at the only end of the critical interval: a floor at it, or a gap.
+
+    It does not where a process predicts the rows near the edge from all others (`left_out`): runs at the edge that lie on one
+    side by chance, or by choice, leave a gap beside it, and cost it log 2 each however well it knows where the edge is.
+    """
     if not critical.one_sided:
         return False
     margin, hit = critical.margin(y), critical.contains(y)
     if int(hit.sum()) < _FEWEST_HITS or hit.all():
         return False
     nearest, spread = float(margin[~hit].min()), float(np.std(y))
+    gap = nearest - float(margin[hit].max())
     floor: Mask = margin[~hit] <= nearest + _EQUAL * float(np.ptp(y))
-    if int(floor.sum()) >= _FEWEST and not floor.all():
-        return True
+    on_floor = int(floor.sum()) >= _FEWEST and not floor.all()
     beside = min(int(hit.sum()), int((~hit).sum())) >= _FEWEST_BESIDE
-    return beside and nearest - float(margin[hit].max()) > _GAP * spread
+    if not on_floor and not (beside and gap > _GAP * spread):
+        return False
+    near = np.abs(margin) <= _NEAR * max(gap, _GAP * spread)
+    return left_out is None or float(np.abs(left_out().mu - y)[near].max(initial=0.0)) > _EXACT * spread

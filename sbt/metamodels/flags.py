@@ -1,0 +1,79 @@
+"""A process of a metric of two values, as a collision has: P(critical) by a probit link.
+
+A process of the values takes them for Gaussian. One run of ninety that collides is nine standard deviations from the others, so
+that a collision is impossible wherever nothing is known; with two or three runs, where the sides meet is as sure as it is wrong.
+Of a noisy simulator it has one noise for a rate of .05 and one of .45. Labels say no more than on which side a run fell.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import log_ndtr
+
+from sbt.metamodels.base import gives_different
+from sbt.metamodels.classifier import Classifier, classifier
+from sbt.metamodels.expectation_propagation import latent, latent_jointly
+from sbt.metamodels.prediction import Prediction
+from sbt.metamodels.sided import placed_by
+from sbt.problem.arrays import Points, Vector
+from sbt.problem.requirement import CriticalInterval
+
+__all__ = ["FlagPredictor", "flag_process"]
+
+
+@dataclass(frozen=True, eq=False)
+class FlagPredictor:
+    """A process of labels as one of the metric, of which P(critical) is that of the label.
+
+    Args:
+        process: fitted to the labels, True where a run is critical.
+        critical: M_c, in the unit of the metric; one of its ends is infinite.
+        apart: distance of the metric's two values > 0.
+        noisy: the same inputs may give both.
+    """
+
+    process: Classifier
+    critical: CriticalInterval
+    apart: float
+    noisy: bool
+
+    def __call__(self, u: Points) -> Prediction:
+        """Return the prediction of y at u (n, d)."""
+        mean, variance = latent(u, self.process.u, self.process.hyper, self.process.belief)
+        width = np.sqrt(1.0 + variance)
+        told, std = placed_by(self.critical, -mean / width, self.apart)
+        return Prediction.gaussian(told, std, std / width if self.noisy else np.zeros(len(u)))
+
+    def mu(self, u: Points) -> Vector:
+        """Return the (n,) mean of y at u (n, d)."""
+        return self(u).mean[0]
+
+    def sample_paths(self, u: Points, n: int, rng: np.random.Generator) -> Points:
+        """Return (n, m) draws of y as a function at u (m, d), of the rate where there is noise; the cost is cubic in m."""
+        mean, covariance = latent_jointly(u, self.process.u, self.process.hyper, self.process.belief)
+        values, vectors = np.linalg.eigh(covariance)
+        drawn = rng.standard_normal((n, len(u))) @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
+        if not self.noisy:  # what is not known is which side it is
+            variance = np.maximum(np.diag(covariance), 1e-12)
+            mean, drawn = mean / np.sqrt(1.0 + variance), drawn / np.sqrt(variance)
+        return placed_by(self.critical, -(mean + drawn), self.apart)[0]
+
+
+def flag_process(
+    critical: CriticalInterval, u: Points, y: Vector, rng: np.random.Generator
+) -> tuple[FlagPredictor, Vector]:
+    """Return the process of a metric of two values, and (n,) log P(side) of left-out rows.
+
+    Args:
+        critical: M_c, which has one of them; one of its ends is infinite.
+        u: (n, d) rows.
+        y: (n,) their metric.
+        rng: the only source of randomness.
+    """
+    hit, noisy = critical.contains(y), gives_different(u, y)
+    process = classifier(u, hit, rng, sharp=not noisy)
+    belief = process.belief
+    ratio = (process.hyper.mean + belief.beside) / np.sqrt(1.0 + belief.wide)
+    return FlagPredictor(process, critical, float(np.ptp(y)), noisy), log_ndtr(np.where(hit, ratio, -ratio))
