@@ -19,25 +19,13 @@ __all__ = ["Classifier", "classifier"]
 
 _LENGTHS = (0.3, 0.1)  # in sqrt(d), from which the search starts, each with one latent spread:
 _SPREAD = 3.0
-_LENGTH_BOUNDS, _LEAST_SPREAD = (-3.5, 4.0), -4.0  # of their logs
+_BOUNDS = ((-3.5, 4.0), (-4.0, math.log(10.0)), (-30.0, 30.0))  # of log lengths, log spread and mean
 _LENGTH_SPREAD = math.sqrt(3.0)  # of the prior of log lengths, about sqrt(2) + log(d) / 2: that of the metamodel of y
-_SPREAD_PRIOR = 1.5  # spread of that of the log latent spread
-_MEANS = 3.0  # in latent spreads: the mean is within
+_SPREAD_PRIOR = (math.log(2.0), 1.5)  # of the log latent spread
+_MEAN_PRIOR = 8.0  # spread of that of the mean about 0
 _LEARNED = 200  # rows that hyperparameters are found by; all are learned from
 _EXPLAINED = 0.5  # of the log likelihood of chance that one start may leave, for which no other is tried
 _WIDE = 2.0  # standard deviations to each end of an interval
-
-
-@dataclass(frozen=True)
-class _Spread:
-    """That of the latent function, in standard deviations of what chance adds: usual, largest, and of the prior of the mean."""
-
-    usual: float
-    largest: float
-    mean: float
-
-
-_BY_CHANCE, _SHARP = _Spread(2.0, 10.0, 8.0), _Spread(50.0, 3000.0, 100.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,22 +52,13 @@ class Classifier:
         return np.asarray(ndtr(mean - _WIDE * np.sqrt(variance))), np.asarray(ndtr(mean + _WIDE * np.sqrt(variance)))
 
 
-def classifier(u: Points, yes: Mask, rng: np.random.Generator, *, sharp: bool = False) -> Classifier:
-    """Return P(yes | u), learned from (m, d) points and their labels, of which both are met.
-
-    Args:
-        u: points.
-        yes: their labels.
-        rng: draws the rows that hyperparameters are found by.
-        sharp: the same point has always the same label, as far as is known: chance is for what the function does not explain.
-    """
+def classifier(u: Points, yes: Mask, rng: np.random.Generator) -> Classifier:
+    """Return P(yes | u), learned from (m, d) points and their labels, of which both are met."""
     low, high, d = np.where(yes, 0.0, -np.inf), np.where(yes, np.inf, 0.0), u.shape[1]
     few = _subset(yes, rng)
     unexplained = _chance(yes[few])
     about = math.sqrt(2.0) + 0.5 * math.log(d)
-    spread = _SHARP if sharp else _BY_CHANCE
-    bounds = _LENGTH_BOUNDS, (_LEAST_SPREAD, math.log(spread.largest)), (-_MEANS * spread.largest, _MEANS * spread.largest)
-    priors = Priors((about, _LENGTH_SPREAD), (math.log(spread.usual), _SPREAD_PRIOR), (0.0, spread.mean), None, bounds)
+    priors = Priors((about, _LENGTH_SPREAD), _SPREAD_PRIOR, (0.0, _MEAN_PRIOR), None, _BOUNDS)
     mean = float(ndtri(yes[few].mean())) * math.hypot(1.0, _SPREAD)
     found: list[tuple[Hyper, float]] = []
     for length in _LENGTHS:

@@ -16,6 +16,7 @@ from sbt.metamodels.base import gives_different
 from sbt.metamodels.classifier import Classifier, classifier
 from sbt.metamodels.expectation_propagation import latent, latent_jointly
 from sbt.metamodels.prediction import Prediction
+from sbt.metamodels.rounded import RoundedPredictor, rounded_process, two_ranges
 from sbt.metamodels.sided import placed_by
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.requirement import CriticalInterval
@@ -25,46 +26,43 @@ __all__ = ["FlagPredictor", "flag_process"]
 
 @dataclass(frozen=True, eq=False)
 class FlagPredictor:
-    """A process of labels as one of the metric, of which P(critical) is that of the label.
+    """A process of how often a noisy flag is critical, as one of the metric.
 
     Args:
         process: fitted to the labels, True where a run is critical.
         critical: M_c, in the unit of the metric; one of its ends is infinite.
         apart: distance of the metric's two values > 0.
-        noisy: the same inputs may give both.
     """
 
     process: Classifier
     critical: CriticalInterval
     apart: float
-    noisy: bool
 
     def __call__(self, u: Points) -> Prediction:
         """Return the prediction of y at u (n, d)."""
         mean, variance = latent(u, self.process.u, self.process.hyper, self.process.belief)
         width = np.sqrt(1.0 + variance)
         told, std = placed_by(self.critical, -mean / width, self.apart)
-        return Prediction.gaussian(told, std, std / width if self.noisy else np.zeros(len(u)))
+        return Prediction.gaussian(told, std, std / width)
 
     def mu(self, u: Points) -> Vector:
         """Return the (n,) mean of y at u (n, d)."""
         return self(u).mean[0]
 
     def sample_paths(self, u: Points, n: int, rng: np.random.Generator) -> Points:
-        """Return (n, m) draws of y as a function at u (m, d), of the rate where there is noise; the cost is cubic in m."""
+        """Return (n, m) draws of the mean of y as a function at u (m, d), which is that of a rate; the cost is cubic in m."""
         mean, covariance = latent_jointly(u, self.process.u, self.process.hyper, self.process.belief)
         values, vectors = np.linalg.eigh(covariance)
         drawn = rng.standard_normal((n, len(u))) @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
-        if not self.noisy:  # what is not known is which side it is
-            variance = np.maximum(np.diag(covariance), 1e-12)
-            mean, drawn = mean / np.sqrt(1.0 + variance), drawn / np.sqrt(variance)
         return placed_by(self.critical, -(mean + drawn), self.apart)[0]
 
 
 def flag_process(
     critical: CriticalInterval, u: Points, y: Vector, rng: np.random.Generator
-) -> tuple[FlagPredictor, Vector]:
+) -> tuple[FlagPredictor | RoundedPredictor, Vector]:
     """Return the process of a metric of two values, and (n,) log P(side) of left-out rows.
+
+    Where equal rows agree it is that of a function of which the metric tells the side; else that of a rate.
 
     Args:
         critical: M_c, which has one of them; one of its ends is infinite.
@@ -72,8 +70,10 @@ def flag_process(
         y: (n,) their metric.
         rng: the only source of randomness.
     """
-    hit, noisy = critical.contains(y), gives_different(u, y)
-    process = classifier(u, hit, rng, sharp=not noisy)
+    if not gives_different(u, y):
+        return rounded_process(two_ranges(y), critical, u, y, None, rng)
+    hit = critical.contains(y)
+    process = classifier(u, hit, rng)
     belief = process.belief
     ratio = (process.hyper.mean + belief.beside) / np.sqrt(1.0 + belief.wide)
-    return FlagPredictor(process, critical, float(np.ptp(y)), noisy), log_ndtr(np.where(hit, ratio, -ratio))
+    return FlagPredictor(process, critical, float(np.ptp(y))), log_ndtr(np.where(hit, ratio, -ratio))

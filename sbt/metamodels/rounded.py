@@ -23,7 +23,9 @@ from sbt.metamodels.warp import Warp
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
-__all__ = ["RoundedPredictor", "Rounding", "StepAware", "better_rounded", "rounding", "without_unit"]
+__all__ = [
+    "RoundedPredictor", "Rounding", "StepAware", "better_rounded", "rounded_process", "rounding", "two_ranges", "without_unit",
+]  # fmt: skip
 
 _FEWEST, _TIED = 10, 0.5
 """Rows, and the least share of those between the first and the last value that have the value of a row elsewhere."""
@@ -102,6 +104,13 @@ def rounding(u: Points, y: Vector, critical: CriticalInterval) -> Rounding | Non
         edge, width = float(middle[k]), float(values[k + 1] - values[k])
     low[0], high[-1] = -np.inf, np.inf
     return Rounding(low[which], high[which], edge, width)
+
+
+def two_ranges(y: Vector) -> Rounding:
+    """Return what a flag y (n,) tells: on which side of the middle between its two values what it stands for lay."""
+    low, high = float(y.min()), float(y.max())
+    middle, upper = 0.5 * (low + high), y == high
+    return Rounding(np.where(upper, middle, -np.inf), np.where(upper, np.inf, middle), middle, high - low)
 
 
 def _values(y: Vector, critical: CriticalInterval) -> tuple[Vector, NDArray[np.intp], Mask | None]:
@@ -205,18 +214,25 @@ def better_rounded(
         shares: (n,) of the space that each row stands for.
         rng: the only source of randomness.
     """
-    scale, inside = float(np.std(y)), critical.contains(y)
-    if not scale > 0.0:
+    if not np.std(y) > 0.0:
         return None
+    found, own = rounded_process(told, critical, u, y, warp, rng)
+    gain = own - score
+    noisy = gives_different(u, y)  # of which others learn how often, as well
+    better = surely_positive(gain, _SURE) and float(shares @ gain) > 0.0 if noisy else not surely_positive(-gain, _SURELY_WORSE)
+    return (found, gain) if better else None
+
+
+def rounded_process(
+    told: Rounding, critical: CriticalInterval, u: Points, y: Vector, warp: Warp | None, rng: np.random.Generator
+) -> tuple[RoundedPredictor, Vector]:
+    """Return a process of what y, of two values or more, was rounded from, and (n,) log P(side) of left-out rows."""
     near = np.argsort(np.abs(y - critical.edge), kind="stable")
     few, rows = (_some(near, most, rng) for most in (_LEARNED, _MOST))
     hyper, _, (low, high) = _learned(told, critical, u, y, warp, few)
     belief = believe(hyper, hyper.covariance(u[rows])[0], low[rows], high[rows])
-    found = RoundedPredictor(u[rows], hyper, belief, scale, told.edge, told.width, critical, warp)
-    gain = found.log_sides(u, inside, rows) - score
-    noisy = gives_different(u, y)  # of which others learn how often, as well
-    better = surely_positive(gain, _SURE) and float(shares @ gain) > 0.0 if noisy else not surely_positive(-gain, _SURELY_WORSE)
-    return (found, gain) if better else None
+    found = RoundedPredictor(u[rows], hyper, belief, float(np.std(y)), told.edge, told.width, critical, warp)
+    return found, found.log_sides(u, critical.contains(y), rows)
 
 
 def without_unit(
