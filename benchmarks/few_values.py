@@ -5,6 +5,7 @@
     python benchmarks/few_values.py estimation [--seeds 8]         # normal and uniform inputs, 150 runs, no stop rule
     python benchmarks/few_values.py logarithms [--seeds 12]        # the same problem as y and as log y, 200 runs
     python benchmarks/few_values.py steps [--seeds 4]              # boundaries of counts, rounded metrics and flags, 100 runs
+    python benchmarks/few_values.py hits [--seeds 100]             # P(critical) of flags by random runs, few of them critical
 
 Campaigns with the product's defaults. Combinations: how many falsifications of 100 runs meet a failure, and how many of as many
 random runs do; how many intervals of an estimation cover, and how many gates pass that should not. Estimation: error and half
@@ -26,10 +27,14 @@ from scipy.special import ndtr
 from scipy.stats import norm
 
 import sbt
-from sbt.problem.arrays import Points, Vector
+from sbt.metamodels.automatic import Auto
+from sbt.metamodels.joint import metamodel_for
+from sbt.problem.arrays import Mask, Points, Vector
+from sbt.problem.requirement import CriticalInterval
 from sbt.seeds import stream
 
 Evaluate = Callable[[dict, int], dict[str, float]]
+QUICK, FLAG = Auto(**Auto.PRESETS["quick"]), CriticalInterval(low=0.5)
 
 
 def campaign(kind: str, inputs: list[sbt.Parameter], low: float, evaluate: Evaluate, seed: int, **keys: object) -> sbt.Result:
@@ -214,12 +219,48 @@ def steps(seeds: range) -> Iterator[str]:
         yield f"| {name} | {d} | {wrong:.2f} | {expected:.2f} | {loss:.4f} | {took:.0f} |"
 
 
+def region(rng: np.random.Generator) -> tuple[Callable[[Points], Mask], int]:
+    """Return a half space, a corner or a ball by some inputs, or a shell, .5 to 20 % of the box, and the number of inputs."""
+    d, share, kind = int(rng.choice([2, 3, 5])), math.exp(rng.uniform(math.log(0.005), math.log(0.2))), int(rng.integers(4))
+    some, middle, weight = rng.permutation(d)[: rng.integers(1, min(d, 3) + 1)], rng.random(d), rng.standard_normal(d)
+    shape: Callable[[Points], Vector] = (
+        lambda u: u @ weight, lambda u: u[:, some].max(axis=1), lambda u: ((u - middle)[:, some] ** 2).sum(axis=1),
+        lambda u: np.abs((u - middle) @ np.abs(weight)),
+    )[kind]  # fmt: skip
+    edge = float(np.quantile(shape(stream(0, "edge").random((20_000, d))), share))
+    return lambda u: shape(u) <= edge, d
+
+
+def hits(seeds: range) -> Iterator[str]:
+    yield "| critical runs | flags | wrong side, in % | expected | log loss | of one P wherever |"
+    told: list[tuple[int, list[float]]] = []
+    for seed in seeds:
+        rng = stream(seed, "flag")
+        inside, d = region(rng)
+        u, at = rng.random((int(rng.choice([40, 90, 150])), d)), stream(1, "points").random((8000, d))
+        hit, critical = inside(u), inside(at)
+        if not hit.any():
+            continue
+        found = metamodel_for(QUICK, FLAG).fit(u, hit.astype(float), stream(seed, "fit"))(at)
+        p, (log_p, log_not), share = found.probability(FLAG), found.log_probability(FLAG), (hit.sum() + 0.5) / (len(u) + 1.0)
+        wrong, loss = ((p > 0.5) != critical).mean(), -np.where(critical, log_p, log_not).mean()
+        base = -np.where(critical, math.log(share), math.log1p(-share)).mean()
+        told.append((int(hit.sum()), [100.0 * wrong, 100.0 * np.minimum(p, 1.0 - p).mean(), loss, base]))
+    for first, last in ((1, 1), (2, 2), (3, 5), (6, 12), (13, 99)):
+        group = [row for n, row in told if first <= n <= last]
+        wrong, expected, loss, base = np.mean(group, axis=0)
+        yield f"| {first} to {last} | {len(group)} | {wrong:.1f} | {expected:.1f} | {loss:.3f} | {base:.3f} |"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("combinations", "values", "estimation", "logarithms", "steps"))
+    parser.add_argument("what", choices=("combinations", "values", "estimation", "logarithms", "steps", "hits"))
     parser.add_argument("--seeds", type=int, default=8)
     given = parser.parse_args()
-    tables = {"combinations": combinations, "values": values, "estimation": estimation, "logarithms": logarithms, "steps": steps}
+    tables = {
+        "combinations": combinations, "values": values, "estimation": estimation, "logarithms": logarithms, "steps": steps,
+        "hits": hits,
+    }  # fmt: skip
     rows = tables[given.what](range(given.seeds))
     for k, row in enumerate(rows):
         print(row, flush=True)
