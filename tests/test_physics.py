@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from pathlib import Path
 
@@ -19,9 +20,11 @@ from sbt.problem.outcome import Doubt, Job, doubts
 from sbt.problem.parameter import Parameter
 from sbt.problem.requirement import Requirement
 from sbt.problem.trace import Trace
-from sbt.sumo.actors import State
+from sbt.sumo.actors import Action, State
 from sbt.sumo.drivers import Braking
-from sbt.sumo.road_ahead import RoadAhead
+from sbt.sumo.dynamics import next_speed
+from sbt.sumo.nets import net_file
+from sbt.sumo.road_ahead import RoadAhead, on_road, path_of
 from sbt.testing import ContractError, check_physics, check_scenario
 
 ONE_LANE = ("emergency_braking", "cut_in")
@@ -145,6 +148,45 @@ def test_braking_with_a_limited_jerk_reaches_its_deceleration_and_final_speed() 
         assert speeds[-1] == final
         assert np.abs(np.diff(a)).max(initial=0.0) / 0.01 <= 30.0 + 1e-6
         assert -a.min() <= deceleration + 1e-9
+
+
+def test_a_speed_beside_an_acceleration_ends_it_and_is_never_jumped_to() -> None:
+    for speed, a, target, dt in itertools.product((0.0, 5.0, 20.0), (-3.0, -0.5, 0.0, 1.0, 8.0), (0.0, 4.9, 5.1, 20.0, 30.0), (0.1, 1)):
+        free = speed + a * dt
+        ends = min(speed, free) <= target <= max(speed, free)
+        reached = next_speed(speed, a, target, dt)
+        assert reached == (target if ends else max(free, 0.0)), (speed, a, target, dt)
+    for a, step in ((-3.0, -1e-12), (3.0, 1e-12)):
+        assert next_speed(20.0 + step, a, 20.0, 0.1) == 20.0, "what SUMO gives back may be rounded"
+    assert math.isnan(next_speed(20.0, -3.0, math.nan, 0.1))
+
+
+def test_who_brakes_ahead_of_the_end_of_a_lane_is_not_slowed_down_for_a_speed_that_braking_never_reaches() -> None:
+    route, own, braking = ("ramp", "merge", "after"), State("ego", 5.0, 1.8, 0.1), Action(acceleration=-3.0, speed=90.0)
+    start = path_of(str(net_file("on_ramp")), route, 0)[0][0][0]
+    own.x, own.y = float(start[0]), float(start[1])
+    own.speed = RoadAhead("on_ramp", route, 0).limit(0.0) - 0.5
+    limited = on_road(_Always(braking), "on_ramp", route, 0, 0.0)
+    assert limited is not None
+    assert limited.act(0.0, own, ()) == braking
+
+
+class _Always:
+    def __init__(self, action: Action) -> None:
+        self._action = action
+
+    def act(self, t: float, own: State, others: tuple[State, ...]) -> Action:
+        return self._action
+
+
+@pytest.mark.parametrize("jerk", [30.0, math.inf])
+def test_who_is_slower_than_the_final_speed_of_its_braking_keeps_its_own(jerk: float) -> None:
+    driver, own = Braking(6.0, 12.0, jerk), State("co", 5.0, 1.8, 0.1)
+    own.speed = 10.0
+    for k in range(5):
+        action = driver.act(0.1 * k, own, ())
+        own.speed = action.speed if action.acceleration is None else next_speed(own.speed, action.acceleration, action.speed, 0.1)
+        assert own.speed == 10.0
 
 
 def test_a_remark_says_what_is_compared_and_whose_it_is() -> None:

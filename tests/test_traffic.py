@@ -12,9 +12,11 @@ from scenario_points import centre, sobol
 
 from sbt.config.assemble import assemble
 from sbt.config.load import parse
+from sbt.config.scenario_file import from_file
 from sbt.execution.spec import ScenarioSpec
 from sbt.plugins import load
 from sbt.sumo.models import CAR_FOLLOWING
+from sbt.sumo.nets import net_file
 from sbt.sumo.session import scratch_folder
 from sbt.workflows.checking import check_scenario
 
@@ -113,6 +115,29 @@ def test_a_python_controller_drives_along_the_route(tmp_path: Path) -> None:
         run, at, dt = whole.actor("ego"), whole.time > 4.5, float(whole.time[1])
         assert run.speed[whole.time < 4.0].min() < 6.0
         assert np.diff(run.speed[at])[:5] == pytest.approx(np.minimum(2.0 * dt, 8.0 - run.speed[at][:5]), abs=1e-9)
+
+
+@pytest.mark.sumo
+def test_who_brakes_with_its_set_speed_ahead_of_it_brakes_in_every_door(tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text(
+        "from sbt.sumo.actors import Action\n\n\nclass Planner:\n    def __init__(self, rng, set_speed):\n        pass\n\n"
+        "    def act(self, t, own, others):\n        return Action(acceleration=-3.0, speed=40.0)\n"
+    )
+    (tmp_path / "r.rou.xml").write_text(
+        '<routes><vType id="t"/><vehicle id="ego" type="t" depart="0" departSpeed="${a}"><route edges="road"/></vehicle></routes>'
+    )
+    (tmp_path / "s.sumocfg").write_text(
+        f'<configuration><input><net-file value="{net_file("straight")}"/><route-files value="r.rou.xml"/></input>'
+        "<time><step-length value='0.1'/></time></configuration>"
+    )
+    (tmp_path / "scenario.yaml").write_text(
+        "sumo: s.sumocfg\nego: {id: ego, kind: own.py:Planner}\ninputs: {a: {min: 8, max: 12}}\nduration: 2\n"
+        "metrics: [deceleration_max]\nrequirement: {metric: deceleration_max, critical: [4, .inf]}\n"
+    )
+    own = load("scenarios", "emergency_braking").configured(ego={"kind": f"{tmp_path}/own.py:Planner"})
+    for run in (own.simulate(centre(own), 1), from_file(str(tmp_path / "scenario.yaml"), tmp_path).simulate({"a": 10.0}, 1)):
+        speed, dt = run.actor("ego").speed, float(run.time[1])
+        assert np.diff(speed)[:10] == pytest.approx(np.full(10, -3.0 * dt), abs=1e-9)
 
 
 @pytest.mark.sumo

@@ -150,7 +150,7 @@ class LaneChange:
 
 
 class Braking:
-    """Brakes with a constant deceleration from the start down to a final speed, and keeps it.
+    """Brakes with a constant deceleration from the start down to a final speed, and keeps it; keeps its own where that is lower.
 
     Args:
         deceleration: m/s^2, positive.
@@ -159,21 +159,20 @@ class Braking:
     """
 
     def __init__(self, deceleration: float, final_speed: float, jerk: float = math.inf):
-        self._action = Action(acceleration=-deceleration, speed=final_speed)
         self._deceleration, self._final, self._jerk = deceleration, final_speed, jerk
         self._first: float | None = None
 
     def act(self, t: float, own: State, others: tuple[State, ...]) -> Action:
         """Return the deceleration with the final speed as its limit, or the speed at the end of the step on a ramp."""
-        if self._jerk == math.inf:
-            return self._action
         if self._first is None:
-            self._first = own.speed
+            self._first, self._final = own.speed, min(self._final, own.speed)
+        if self._jerk == math.inf:
+            return Action(acceleration=-self._deceleration, speed=self._final)
         return Action(speed=self._at(t + own.step, self._first))
 
     def _at(self, t: float, first: float) -> float:
         """Return the speed at time t (m/s), in closed form: the deceleration is a trapezoid, or a triangle."""
-        drop = max(first - self._final, 0.0)
+        drop = first - self._final
         ramp = min(self._deceleration / self._jerk, math.sqrt(drop / self._jerk))
         if ramp <= 0.0:
             return first

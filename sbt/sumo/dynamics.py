@@ -11,13 +11,23 @@ __all__ = ["MAX_SPEED", "DeadTime", "FirstOrderLag", "Gust", "JerkLimitedStop", 
 
 MAX_SPEED = 1e4
 """Commanded speeds must be below this (m/s): no road user comes near it, NaN and infinity are excluded."""
+_AT_TARGET = 1e-6
+"""Who is as near to a target speed is there (m/s): what SUMO gives back of a commanded speed may be rounded."""
 
 
 def next_speed(speed: float, acceleration: float, target: float | None, dt: float) -> float:
-    """Return the speed after a step of constant acceleration that ends at the target speed and at standstill (m/s)."""
+    """Return the speed after a step of constant acceleration that ends at the target speed and at standstill (m/s).
+
+    A target that the acceleration leads away from is never reached: it changes nothing. NaN gives NaN.
+    """
     reached = speed + acceleration * dt
     if target is not None:
-        reached = max(reached, target) if acceleration < 0 else min(reached, target)
+        if math.isnan(target):
+            return target
+        if acceleration < 0.0 and target <= speed + _AT_TARGET:
+            reached = max(reached, target)
+        elif acceleration > 0.0 and target >= speed - _AT_TARGET:
+            reached = min(reached, target)
     return 0.0 if reached < 0.0 else reached
 
 
