@@ -16,14 +16,14 @@ from sbt.plugins import Scope, load
 from sbt.problem.covariates import Covariates, telling_all
 from sbt.seeds import stream
 from sbt.sumo.actors import Actor, VehicleType
-from sbt.sumo.projecting import Arrivals, arrivals_at, crossing_of, first_gap, gaps, taken_gap, time_to_reach
+from sbt.sumo.projecting import Arrivals, arrivals_at, crossing_of, driver_value, first_gap, gaps, taken_gap, time_to_reach
 from sbt.workflows.drawn import covariates_first
 from sbt.workflows.study import Study
 
 NAMES = ("crossing_pedestrian", "highway_merge", "roundabout_entry", "unprotected_left_turn")
 
 
-def car(k: int, position: float, speed: float, **attributes: float) -> Actor:
+def car(k: int, position: float, speed: float, **attributes: float | str) -> Actor:
     kind = VehicleType(attributes=tuple((name, str(value)) for name, value in attributes.items()))
     return Actor(f"car_{k}", ("a",), 0, position, speed, type=kind)
 
@@ -44,6 +44,25 @@ def test_who_is_faster_queues_behind_who_is_slower_and_leaves_the_foremost_alone
     assert both.time[0] == alone.time[0]
     assert both.time[1] - both.time[0] >= 1.0
     assert both.speed[1] == both.speed[0]
+
+
+@pytest.mark.parametrize("text", ["norm(1,0.3)", "norm(1.1)", "normc(1,0.3,0.2,2)", "normc(1,0.3,0.9,1.6)", "normc(1,0.3,0.9)", "1.2"])
+def test_what_sumo_draws_of_a_type_counts_with_its_mean(text: str) -> None:
+    mean, deviation, low, high = (*map(float, text.strip("normc()").split(",")), *(0.0, -9.0, 9.0)[text.count(",") :])
+    drawn = mean + deviation * stream(1, "factors").standard_normal(400_000)
+    drawn = drawn[(drawn >= low) & (drawn <= high)]
+    given = driver_value(car(0, 0.0, 10.0, speedFactor=text), "speedFactor", 7.0)
+    assert given == pytest.approx(drawn.mean(), abs=5e-3)
+    there, same = (arrivals_at(300.0, [car(0, 10.0, 10.0, speedFactor=each)], 14.0) for each in (text, given))
+    assert (there.time, there.speed) == (same.time, same.speed)
+
+
+@pytest.mark.parametrize("text", ["off", "nan", "inf", "-inf", "", "norm(inf,1)", "normc(1,0.1,3,4)", "normc(1,0,1,1)", "norm(1,0.1"])
+def test_no_text_of_an_attribute_stops_a_projection(text: str) -> None:
+    assert math.isfinite(driver_value(car(0, 0.0, 10.0, impatience=text), "impatience", 0.0))
+    queue = [car(k, 100.0 - 20.0 * k, 10.0, **{name: text}) for k, name in enumerate(("sigma", "accel", "tau", "minGap"))]
+    there = arrivals_at(300.0, queue, 14.0, fastest=50.0)
+    assert np.isfinite([there.time, there.speed]).all()
 
 
 def test_the_first_gap_is_the_first_one_that_is_long_enough() -> None:
@@ -282,3 +301,50 @@ def test_covariates_that_change_stop_the_campaign(tmp_path: Path) -> None:
         sbt.run(
             campaign="falsification", scenario=scenario, budget=40, seed=1, executor="serial", report=False, store=tmp_path / "s"
         )
+
+
+DRAWN = """
+import sbt
+from sbt.sumo.actors import Actor, Scene, VehicleType
+from sbt.sumo.simulation import SumoSimulation
+
+INPUTS, NEED = [sbt.Parameter("v", 10, 24, "m/s")], sbt.Requirement("ttc_min", high=1.0)
+
+def scene(values, ego, rng):
+    kind = VehicleType(attributes=(("speedFactor", "normc(1,0.1,0.8,1.2)"),))
+    return Scene((
+        Actor("ego", ("road",), 1, 50.0, values["v"], ego.driver(rng, values["v"]), ego.vehicle_type(VehicleType(), values["v"])),
+        Actor("co", ("road",), 1, 90.0 + rng.uniform(0.0, 20.0), 20.0, type=kind),
+    ))
+
+def raising(values, scene):
+    raise LookupError("no such car")
+
+def scenario(covariates=None):
+    simulate = SumoSimulation(net="straight", scene=scene, duration=0.5, step_length=0.1, covariates=covariates)
+    return sbt.Scenario("drawn", INPUTS, NEED, simulate=simulate, metrics=["ttc_min"])
+
+def evaluate(values, seed):
+    return {"ttc_min": values["v"]}
+
+PLAIN, OWN = scenario(), scenario(raising)
+TELLS_NONE = sbt.Scenario("none", INPUTS, NEED, evaluate=evaluate, metrics=["ttc_min"])
+"""
+
+
+@pytest.mark.sumo
+@pytest.mark.parametrize(
+    ("scenario", "asked", "said"),
+    [
+        ("PLAIN", "true", "covariates of 3 pairs, the same before and after them"),
+        ("OWN", "auto", "no such car"),
+        ("OWN", "false", None),
+        ("TELLS_NONE", "true", "covariates: true needs a scenario whose traffic is drawn before the run"),
+    ],
+)
+def test_check_of_a_configuration_proves_what_the_campaign_looks_at(tmp_path: Path, scenario: str, asked: str, said: str | None):
+    (tmp_path / "drawn.py").write_text(DRAWN)
+    (tmp_path / "c.yaml").write_text(f"campaign: falsification\nscenario: drawn.py:{scenario}\nbudget: 30\ncovariates: {asked}\n")
+    found = [f for f in sbt.check(tmp_path / "c.yaml").findings if f.rule == "covariates are known before the run"]
+    assert [f.ok for f in found] == ([] if said is None else [scenario == "PLAIN"])
+    assert said is None or said in found[0].detail

@@ -151,7 +151,8 @@ def test_braking_with_a_limited_jerk_reaches_its_deceleration_and_final_speed() 
 
 
 def test_a_speed_beside_an_acceleration_ends_it_and_is_never_jumped_to() -> None:
-    for speed, a, target, dt in itertools.product((0.0, 5.0, 20.0), (-3.0, -0.5, 0.0, 1.0, 8.0), (0.0, 4.9, 5.1, 20.0, 30.0), (0.1, 1)):
+    speeds, targets = (0.0, 5.0, 20.0), (0.0, 4.9, 5.1, 20.0, 30.0)
+    for speed, a, target, dt in itertools.product(speeds, (-3.0, -0.5, 0.0, 1.0, 8.0), targets, (0.1, 1.0)):
         free = speed + a * dt
         ends = min(speed, free) <= target <= max(speed, free)
         reached = next_speed(speed, a, target, dt)

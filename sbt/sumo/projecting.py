@@ -7,10 +7,12 @@ ego's own arrival at the place of conflict teach it much.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import ndtr
 
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.sumo.actors import Actor
@@ -28,6 +30,10 @@ _SLOWEST = 1.0
 """Speed below which nobody is projected (m/s)."""
 _STANDARD = {"accel": 2.6, "decel": 4.5, "minGap": 2.0, "sigma": 0.5, "speedFactor": 1.0, "tau": 1.0}
 """Of vehicles whose types say nothing."""
+_DRAWN = re.compile(r"normc?\((.*?)\)?")
+"""SUMO's distributions of an attribute: mean, deviation and, where given, the ends."""
+_LARGEST = 1e6
+"""No attribute is larger: SUMO takes `inf`, too."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +68,7 @@ def arrivals_at(place: float, cars: Sequence[Actor], limit: float, *, fastest: f
     """
     if not cars:
         return Arrivals(np.empty(0), np.empty(0))
-    types = [_STANDARD | {k: float(v) for k, v in a.type.attributes if k in _STANDARD} for a in cars]
+    types = [_STANDARD | {k: _mean(v, _STANDARD[k]) for k, v in a.type.attributes if k in _STANDARD} for a in cars]
     position, start = np.array([a.position for a in cars]), np.array([a.speed for a in cars])
     wanted = np.array([t["speedFactor"] * limit - 0.5 * t["sigma"] * t["accel"] for t in types])
     speed = np.clip(wanted, _SLOWEST, fastest)
@@ -76,8 +82,28 @@ def arrivals_at(place: float, cars: Sequence[Actor], limit: float, *, fastest: f
 
 
 def driver_value(actor: Actor, name: str, otherwise: float) -> float:
-    """Return a number among the attributes of an actor's type, or another where it has none of this name."""
-    return float(dict(actor.type.attributes).get(name, otherwise))
+    """Return a number among the attributes of an actor's type, or another where it has none of this name.
+
+    It is the mean where SUMO draws it (`norm(1,0.1)`, `normc(1,0.1,0.2,2)`), and the other one where it is no number (`off`).
+    """
+    return _mean(dict(actor.type.attributes).get(name, otherwise), otherwise)
+
+
+def _mean(text: object, otherwise: float) -> float:
+    """Return the number that SUMO reads from an attribute, or the mean of those that it draws, cut to what is within bounds."""
+    drawn = _DRAWN.fullmatch(str(text))
+    try:
+        numbers = [float(each) for each in (drawn[1] if drawn else str(text)).split(",")]
+    except ValueError:
+        return otherwise
+    mean, deviation, low, high = (*numbers, *(0.0, -math.inf, math.inf)[len(numbers) - 1 :])[:4]
+    if math.isnan(mean):
+        return otherwise
+    if deviation > 0.0 and abs(mean) < _LARGEST:
+        ends = (np.array([low, high]) - mean) / deviation
+        inside, edge = float(np.diff(ndtr(ends))[0]), np.exp(-0.5 * ends**2) / math.sqrt(2.0 * math.pi)
+        mean += deviation * float(edge[0] - edge[1]) / inside if inside > 0.0 else 0.0
+    return max(-_LARGEST, low, min(mean, high, _LARGEST))
 
 
 def time_to_reach(distance: Vector | float, start: Vector | float, wanted: Vector | float, accel: Vector | float) -> Vector:

@@ -30,7 +30,7 @@ from sbt.sumo.files import SumoFiles
 from sbt.sumo.messages import DROPPED, dropped
 from sbt.sumo.suggesting import units_apart
 from sbt.workflows.comparing import compared_times
-from sbt.workflows.drawn import covariates_first
+from sbt.workflows.drawn import Told, covariates_first
 from sbt.workflows.fidelity import fidelity_findings
 from sbt.workflows.findings import Finding, row_findings, some_rows
 from sbt.workflows.rehearsal import rehearse
@@ -105,19 +105,21 @@ def check_scenario(spec: ScenarioSpec, seed: int = 0, scenario: LogicalScenario 
     return tuple(findings_of(spec, seed, scenario))
 
 
-def findings_of(spec: ScenarioSpec, seed: int = 0, scenario: LogicalScenario | None = None) -> Iterator[Finding]:
-    """Yield the findings of `check_scenario`, each as soon as it is known."""
+def findings_of(
+    spec: ScenarioSpec, seed: int = 0, scenario: LogicalScenario | None = None, told: Told | None = None
+) -> Iterator[Finding]:
+    """Yield the findings of `check_scenario`, each as soon as it is known; `told` gives the covariates of a campaign."""
     with keeping_states(spec) as kept:
-        yield from _findings(kept, seed, scenario)
+        yield from _findings(kept, seed, scenario, told)
 
 
-def _findings(spec: ScenarioSpec, seed: int, scenario: LogicalScenario | None) -> Iterator[Finding]:
+def _findings(spec: ScenarioSpec, seed: int, scenario: LogicalScenario | None, told: Told | None) -> Iterator[Finding]:
     asked = scenario if scenario is not None else spec.resolve()
     yield from which_isolation(spec)
     yield from row_findings(asked)
     points = some_rows(asked) or list(_points(asked.space))
     jobs = [(values, run_seed(seed, k)) for k, values in enumerate(points)]
-    drawn = covariates_first(asked, jobs)
+    drawn = covariates_first(asked, jobs, told)
     other = _elsewhere(spec, jobs)
     if isinstance(other, _Lost) and other.for_good:
         yield Finding(_ALL_RUN, ok=False, detail=other.why)

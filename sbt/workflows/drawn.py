@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from sbt.problem.scenario import LogicalScenario
 from sbt.seeds import stream
 from sbt.workflows.findings import Finding
 
-__all__ = ["covariates_first"]
+__all__ = ["Told", "covariates_first"]
 
 _RULE = "covariates are known before the run"
 _SPREAD = 200
@@ -22,21 +23,29 @@ _SPREAD = 200
 campaign."""
 
 
-def covariates_first(scenario: LogicalScenario, jobs: Sequence[tuple[Values, int]]) -> Callable[[], list[Finding]]:
+Told = Callable[[], Covariates | None]
+"""Gives what a campaign looks at of what seeds draw; None: nothing."""
+
+
+def covariates_first(
+    scenario: LogicalScenario, jobs: Sequence[tuple[Values, int]], told: Told | None = None
+) -> Callable[[], list[Finding]]:
     """Compute the covariates of runs that are still to be executed; what is returned computes them again, and compares.
 
     Args:
         scenario: as configured.
         jobs: values and seed of each run.
+        told: its covariates, where a campaign asks for others than its own.
     """
-    before, names, problem = _computed(scenario, jobs)
+    told = partial(Covariates.of, scenario) if told is None else told
+    before, names, problem = _computed(told, jobs)
 
     def afterwards() -> list[Finding]:
         if problem:
             return [Finding(_RULE, ok=False, detail=problem)]
         if before is None:
             return []
-        after, _, failed = _computed(scenario, jobs)
+        after, _, failed = _computed(told, jobs)
         if failed or after is None:
             return [Finding(_RULE, ok=False, detail=f"after the runs: {failed or 'there are none'}")]
         differ = [name for k, name in enumerate(names) if (before[:, k] != after[:, k]).any()]
@@ -47,14 +56,15 @@ def covariates_first(scenario: LogicalScenario, jobs: Sequence[tuple[Values, int
     return afterwards
 
 
-def _computed(scenario: LogicalScenario, jobs: Sequence[tuple[Values, int]]) -> tuple[Points | None, tuple[str, ...], str]:
+def _computed(told: Told, jobs: Sequence[tuple[Values, int]]) -> tuple[Points | None, tuple[str, ...], str]:
     """Return the covariates (n, c) of these pairs and their names, or why there are none; None: the scenario tells none."""
     try:
-        found = Covariates.of(scenario)
+        found = told()
         if found is None:
             return None, (), ""
-        x = np.array([[p.number(values[p.name]) for p in scenario.space.parameters] for values, _ in jobs])
-        found.at(scenario.space.sample(_SPREAD, stream(0, "covariates")), range(_SPREAD), keep=False)
-        return found.at(x, [seed for _, seed in jobs]), found.names, ""
+        space = found.scenario.space
+        x = np.array([[p.number(values[p.name]) for p in space.parameters] for values, _ in jobs])
+        found.at(space.sample(_SPREAD, stream(0, "covariates")), range(_SPREAD), keep=False)
+        return found.at(x, [seed for _, seed in jobs], keep=False), found.names, ""
     except SbtError as error:
         return None, (), str(error)

@@ -248,7 +248,7 @@ def findings_in(target: LogicalScenario | str | Path, *, seed: int, isolation: s
     plugins.forget_changed()
     if isinstance(target, str | Path) and Path(target).suffix in (".yaml", ".yml") and not is_scenario(Path(target)):
         study = Study(load(target))
-        return chain(_starts_warm(study), findings_of(study.spec, seed, study.scenario))
+        return chain(_starts_warm(study), findings_of(study.spec, seed, study.scenario, lambda: study.covariates))
     return findings_of(_spec(target, isolation), seed)
 
 
