@@ -1,5 +1,7 @@
 """What conclusions say where runs give no metric, and where an interval is wider than asked."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -8,12 +10,18 @@ import sbt
 from sbt.campaigns.boundary import BoundaryConclusion
 from sbt.campaigns.clustering import Spread
 from sbt.campaigns.estimation import EstimationConclusion
+from sbt.campaigns.gate import GateVerdict
+from sbt.campaigns.lost import failed_runs
 from sbt.campaigns.parts import CriticalShare
 from sbt.campaigns.telling import tell_boundary, tell_estimation, tell_share
 from sbt.cli import app
-from sbt.loop.stages import Facts
+from sbt.estimators import binomial
+from sbt.loop.stages import Facts, Log
 from sbt.problem.requirement import Requirement
+from sbt.seeds import stream
+from sbt.store.database import Store
 from sbt.store.history import History, Rows
+from sbt.workflows.study import Study
 
 LOW = Requirement("m", high=0.0)
 NARROW = {"probability": 0.1, "low": 0.09, "high": 0.11, "cov": 0.05, "hits": 40, "counted": 60, "undetected_mass_bound": 0.05}
@@ -146,3 +154,70 @@ def test_that_nearly_all_is_critical_does_not_deny_the_runs_that_were_not(safe):
     assert ("which no run met" in said[1]) == (safe == 0)
     assert ("is 1 (" in said[0]) == (safe == 0)
     assert safe == 0 or ("is at least 0.905" in said[0] and "9 runs were not critical" in said[1])
+
+
+class _Cars:
+    """Critical by an input, what the seed draws and tells, and noise."""
+
+    def __call__(self, values, seed):
+        return {"m": values["a"] + self.known_before(values, seed)["w"] + 0.2 * stream(seed, "driver").standard_normal() + 0.9}
+
+    def known_before(self, values, seed):
+        return {"w": float(stream(seed, "car").standard_normal())}
+
+
+@pytest.mark.parametrize(("budget", "covariates"), [(12, True), (80, True), (80, False)])
+def test_a_failed_run_is_told_to_count_where_the_interval_depends_on_it(tmp_path, budget, covariates):
+    """And only there: those of stages that search, learn or repeat were told to be in the upper end."""
+    scenario = sbt.Scenario("cars", [sbt.Parameter("a", 0, 1)], LOW, evaluate=_Cars(), metrics=["m"])
+    store = sbt.run(
+        campaign="estimation", scenario=scenario, budget=budget, seed=2, covariates=covariates, store=tmp_path / "s",
+        stop={"cov": None}, executor="serial", report=False,
+    ).store  # fmt: skip
+    with Store.read(store) as opened:
+        study = Study.from_store(opened, objects={("scenarios", "object:cars"): scenario}, live=True)
+        history, iterations = opened.history(), tuple(opened.iterations())
+
+    def concluded(failed):
+        columns = {**history.columns, "status": np.where(failed, "failed", history.columns["status"]).astype(object)}
+        columns["y.m"] = np.where(failed, np.nan, columns["y.m"])
+        found, _ = study.campaign.conclude(Log(replace(history, columns=columns), iterations, ()))
+        return found
+
+    safe, told = ~LOW.critical_runs(history), set()
+    before = concluded(np.zeros(len(history), dtype=bool))
+    for stage in np.unique(history.stage[safe]):
+        row = np.flatnonzero(safe & (history.stage == stage))[-1]
+        found = concluded(np.arange(len(history)) == row)
+        counts = "count them as safe, the upper end as critical" in found.warnings[0]
+        assert counts or found.warnings[0] == f"1 of {budget} runs failed, none of them a draw that counts"
+        assert counts == ((before.high, before.low) != (found.high, found.low)), stage
+        told.add(counts)
+    assert budget < 80 or told == {True, False}
+
+
+def test_failed_runs_are_told_apart_by_whether_they_count():
+    assert failed_runs(0, 0, 9) == ()
+    (every,) = failed_runs(2, 2, 9)
+    assert every == "2 of 9 runs failed: the estimate and its lower end count them as safe, the upper end as critical"
+    (some,) = failed_runs(1, 3, 9)
+    assert some.startswith("3 of 9 runs failed: the estimate and its lower end count 1 of them as safe")
+    assert some.endswith("the others are no draws that count")
+
+
+@pytest.mark.parametrize(
+    "kind", [{}, {"cov": 0.3, "hits": 4}, {"cov": 0.02, "hits": 400}, {"gate": GateVerdict("undecided", 0.1, 0.95, 0.3, 0.0, "")}]
+)
+@pytest.mark.parametrize(("p", "n"), [(0.157, 150), (0.02, 300), (0.9, 200), (0.0, 100)])
+def test_crude_draws_are_advised_wherever_their_interval_would_be_clearly_narrower(p, n, kind):
+    """Whatever else is advised: of an estimate that others would have narrowed it was told only where the upper end was high."""
+    rows = Rows(("a",))
+    rows.append(np.zeros((n, 1)), {"status": ["ok"] * n, "index": range(n)}, [{"m": 1.0}] * n)
+    facts, (low, high) = Facts(rows.history(), LOW, "m", "s"), map(float, binomial.interval(n * p, n))
+    for times in (0.5, 1.0, 1.4, 1.6, 3.0):
+        ends = {"low": max(p - times * (p - low), 0.0), "high": min(p + times * (high - p), 1.0)}
+        wide = ends["high"] - ends["low"] > 1.5 * (high - low) or ends["high"] > 1.5 * high
+        bound = {"exact_bound": ends["high"], "hits": 0} if p == 0.0 else {}
+        given = {**NARROW, **kind, "probability": p, "failed_as_critical": p, **ends, **bound}
+        said = tell_estimation(EstimationConclusion(**given), facts)[2]
+        assert ("would bound it better (acquisition: {kind: monte_carlo})" in said) == wide, said

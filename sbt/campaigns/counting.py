@@ -128,6 +128,7 @@ class Seen:
             any metamodel. With constraints a point of a pool that was drawn again is none: it is not another one.
         hits: critical ones of these draws.
         failed: failed ones of these draws.
+        failed_apart: of these, draws of other stages than those that the estimate is of.
         surprises: critical ones of these draws to which the metamodel gave next to no probability.
         known: different inputs of critical runs; where any of several requirements is enough, of the one that is known by fewest.
         surprised: number of the last batch that had a surprise; -1: none had.
@@ -141,6 +142,12 @@ class Seen:
     surprises: int
     known: int
     surprised: int = -1
+    failed_apart: int = 0
+
+    @property
+    def without_failed_apart(self) -> Seen:
+        """The same, had the failed draws of other stages been uncritical."""
+        return replace(self, failed=self.failed - self.failed_apart, failed_apart=0)
 
     @classmethod
     def of(cls, log: Log, settings: Settings) -> Seen:
@@ -164,7 +171,7 @@ class Seen:
         return cls(
             int(critical.sum()), int((history.ok & ~critical).sum()), len(mine), int(critical[mine].sum()),
             int((~history.ok[mine]).sum()), int((critical[mine] & denied).sum()),
-            _known(settings.scenario.requirement, history), surprised,
+            _known(settings.scenario.requirement, history), surprised, int((~history.ok & (history.stage != DRAWN))[mine].sum()),
         )  # fmt: skip
 
     def most(self, hits: int, confidence: float) -> float:

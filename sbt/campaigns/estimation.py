@@ -25,6 +25,7 @@ from sbt.campaigns.explained import ExplainedVariance, explained_variance
 from sbt.campaigns.gate import GateVerdict, Limits, gate_verdict
 from sbt.campaigns.levels import LevelsTold, is_two_level, left_two_levels, levels_told
 from sbt.campaigns.likeness import EarlierTold, earlier_told
+from sbt.campaigns.lost import failed_runs
 from sbt.campaigns.many_inputs import ManyInputsStage, took_subset
 from sbt.campaigns.pairing import PairStage, pairs_of, pairs_words
 from sbt.campaigns.precision import cautions
@@ -184,11 +185,6 @@ def recipe(settings: Settings) -> Campaign:
 def _campaign(settings: Settings, stage: Stage, concluded: Callable[[Log, Settings], Concluded]) -> Campaign:
     def conclude(log: Log) -> tuple[EstimationConclusion, None]:
         found, limits = concluded(log, settings)
-        failed = int((~log.history.ok).sum())
-        if failed:
-            counted = "the estimate and its lower end count them as safe, the upper end as critical"
-            warning = f"{failed} of {len(log.history)} runs failed: {counted}"
-            found = replace(found, warnings=(warning, *found.warnings))
         traffic = warmed_traffic(log, settings)
         found, limits = on_warm_ups(found, limits, traffic)
         noise = stated_noise(log.history, settings.scenario) if (log.history.stage == REPEAT).any() else None
@@ -221,19 +217,23 @@ def on_warm_ups(found: EstimationConclusion, limits: Limits, traffic: Spread | N
     return replace(found, low=low, high=high, cov=cov, warnings=warnings, warmed_traffic=traffic), limits
 
 
-def _conclusion(probability: float | None, limits: Limits, **rest: Any) -> EstimationConclusion:
-    """Return the conclusion with the interval that the limits give."""
+def _conclusion(
+    log: Log, probability: float | None, limits: Limits, *, failed: int, warnings: tuple[str, ...] = (), **rest: Any
+) -> EstimationConclusion:
+    """Return the conclusion with the interval that the limits give; `failed` runs count."""
     tail = 0.5 * (1.0 + _CONFIDENCE)
     given = {"failed_as_safe": probability, "failed_as_critical": probability} | rest
-    return EstimationConclusion(probability, limits.lower(tail), limits.upper(tail), **given)
+    said = failed_runs(failed, int((~log.history.ok).sum()), len(log.history))
+    return EstimationConclusion(probability, limits.lower(tail), limits.upper(tail), warnings=(*said, *warnings), **given)
 
 
-def _from_batches(log: Log, settings: Settings) -> Concluded:
-    """Return what the sequential estimator says."""
+def _from_batches(log: Log, settings: Settings, seen: Seen | None = None) -> Concluded:
+    """Return what the sequential estimator says; `seen` None: what the runs of the log met."""
+    seen = Seen.of(log, settings) if seen is None else seen
     safe, critical = counted_batches(log, settings), counted_batches(log, settings, failed_critical=True)
     if not safe:
-        return _uncounted(log, settings)
-    low, high, seen = combine_estimates(safe), combine_estimates(critical), Seen.of(log, settings)
+        return _uncounted(log, seen)
+    low, high = combine_estimates(safe), combine_estimates(critical)
     counted, hits, worst = sum(len(b.critical) for b in safe), _hits(safe), _hits(critical)
     misses = counted - worst
     few_low, few_high = min(hits, counted - hits) < FEW_HITS, min(worst, misses) < FEW_HITS  # the same where no run failed
@@ -285,14 +285,23 @@ def _from_batches(log: Log, settings: Settings) -> Concluded:
         warnings += denied_by_draws(seen, value, highest, 0.5 * (1.0 + _CONFIDENCE))
     warnings += cautions(len(safe), low.largest_term, value, seen.surprises)
     return _conclusion(
-        value, limits, cov=low.std_error / low.value if value > 0 else None, hits=hits, failed_as_safe=value,
-        effective_sample_size=low.effective_sample_size,
+        log, value, limits, failed=worst - hits + _failed_beside(log, settings, seen, limits), hits=hits, failed_as_safe=value,
+        cov=low.std_error / low.value if value > 0 else None, effective_sample_size=low.effective_sample_size,
         failed_as_critical=max(_clipped(high.value), value) if failing else value,
         undetected_mass_bound=seen.most(seen.surprises, _CONFIDENCE), warnings=tuple(warnings),
         largest_weight_share=low.largest_share,
         convergence=_convergence(log, safe, critical) if seen.critical and seen.safe else None,
         counted=counted, exact_bound=exact_bound,
     ), limits  # fmt: skip
+
+
+def _failed_beside(log: Log, settings: Settings, seen: Seen, limits: Limits) -> int:
+    """Return how many failed runs beside the draws of an estimate its limits depend on."""
+    if not seen.failed_apart:
+        return 0
+    other, tail = _from_batches(log, settings, seen.without_failed_apart)[1], 0.5 * (1.0 + _CONFIDENCE)
+    same = other.lower(tail) == limits.lower(tail) and other.upper(tail) == limits.upper(tail)
+    return 0 if same else seen.failed_apart
 
 
 def _convergence(log: Log, safe: list[CountedBatch], critical: list[CountedBatch]) -> tuple[EstimateStep, ...]:
@@ -306,16 +315,16 @@ def _convergence(log: Log, safe: list[CountedBatch], critical: list[CountedBatch
     return tuple(steps)
 
 
-def _uncounted(log: Log, settings: Settings) -> Concluded:
+def _uncounted(log: Log, seen: Seen) -> Concluded:
     """Return what is known before any draw counts: the bound by the draws there are."""
-    seen = Seen.of(log, settings)
     n = len(log.history)
     few = f"no draw counts: {plural(n, 'run')} {'is' if n == 1 else 'are'} too few to search, to learn and to count"
     if seen.critical:
         limits = Limits(lambda _: 0.0, lambda _: 1.0)
-        return _conclusion(None, limits, warnings=(few,)), limits
+        return _conclusion(log, None, limits, failed=0, warnings=(few,)), limits
     limits = _nothing_critical(seen)
-    return _conclusion(None, limits, warnings=(few, NOTHING_CRITICAL), exact_bound=limits.upper(_CONFIDENCE)), limits
+    exact, warnings = limits.upper(_CONFIDENCE), (few, NOTHING_CRITICAL)
+    return _conclusion(log, None, limits, failed=seen.failed, warnings=warnings, exact_bound=exact), limits
 
 
 def _nothing_critical(seen: Seen) -> Limits:
@@ -331,7 +340,8 @@ def _from_nominal(log: Log, settings: Settings, stage: str = NOMINAL) -> Conclud
     if share.hits == 0:
         rest = {"exact_bound": share.upper(_CONFIDENCE), "warnings": (NOTHING_CRITICAL,)}
     return _conclusion(
-        share.value if share.n else None, limits, cov=share.cov, effective_sample_size=float(share.n), hits=share.hits,
+        log, share.value if share.n else None, limits, failed=share.failed, cov=share.cov,
+        effective_sample_size=float(share.n), hits=share.hits,
         failed_as_safe=share.value, failed_as_critical=(share.hits + share.failed) / max(share.n, 1),
         undetected_mass_bound=1.0 - (1.0 - _CONFIDENCE) ** (1.0 / max(share.n, 1)), counted=share.n, **rest,
     ), limits  # fmt: skip
@@ -360,7 +370,8 @@ def conclude_sum(log: Log, settings: Settings) -> Concluded:
     value, limits = _clipped(found.share.value), Limits(found.lower, found.upper)
     bound = limits.upper(_CONFIDENCE) if found.hits == 0 and found.noisy else None
     return _conclusion(
-        value, limits, cov=found.std_error / value if value > 0 else None, hits=found.hits, failed_as_safe=value,
+        log, value, limits, failed=int(found.worst.critical.sum()) - found.hits,
+        cov=found.std_error / value if value > 0 else None, hits=found.hits, failed_as_safe=value,
         failed_as_critical=_clipped(found.worst.value), effective_sample_size=float(len(found.share.weight)),
         undetected_mass_bound=found.missing, counted=len(found.share.weight), combinations=found.combinations, exact_bound=bound,
         drawn_combinations=found.drawn or None,
@@ -370,7 +381,7 @@ def conclude_sum(log: Log, settings: Settings) -> Concluded:
 def _from_repeats(log: Log, settings: Settings) -> Concluded:
     """Return what the repeats of subset simulation say."""
     value, limits, rest = told_by_repeats(log, settings, _CONFIDENCE)
-    return _conclusion(value, limits, **rest), limits
+    return _conclusion(log, value, limits, failed=int((~log.history.ok).sum()), **rest), limits
 
 
 def _clipped(value: float) -> float:

@@ -8,8 +8,8 @@ from sbt.campaigns.wording import percent, plural
 from sbt.loop.stages import Facts
 
 __all__ = [
-    "decides_bound", "decides_share", "equally_near", "lost_runs", "nearest_words", "none_gave_a_metric", "nothing_known",
-    "repetitions", "why_they_fail",
+    "decides_bound", "decides_share", "equally_near", "failed_runs", "lost_runs", "nearest_words", "none_gave_a_metric",
+    "nothing_known", "repetitions", "why_they_fail",
 ]  # fmt: skip
 
 _HALF = 0.5
@@ -36,6 +36,19 @@ def nothing_known(facts: Facts) -> list[str]:
 def why_they_fail() -> str:
     """Return the advice for runs that fail."""
     return "look at why they failed (table of failed runs in the report, export), mend it, and run the campaign in a new store"
+
+
+def failed_runs(counting: int, failed: int, n: int) -> tuple[str, ...]:
+    """Return how many of n runs failed, and how an estimate counts those that it counts; () where none failed."""
+    if not failed:
+        return ()
+    said = f"{failed} of {n} runs failed"
+    if not counting:
+        return (f"{said}, none of them a draw that counts",)
+    how = "the estimate and its lower end count {} as safe, the upper end as critical"
+    if counting == failed:
+        return (f"{said}: {how.format('them')}",)
+    return (f"{said}: {how.format(f'{counting} of them')}; the others are no draws that count",)
 
 
 def lost_runs(lost: int, n: int) -> str:
