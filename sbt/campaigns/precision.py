@@ -13,7 +13,7 @@ from sbt.estimators.intervals import FEWEST_HITS, WIDEST
 if TYPE_CHECKING:
     from sbt.campaigns.estimation import EstimationConclusion
 
-__all__ = ["NO_BETTER", "PRECISE", "always_agree", "cautions", "more_runs", "rounded", "too_wide", "width"]
+__all__ = ["NO_BETTER", "PRECISE", "always_agree", "as_many_draws", "cautions", "more_runs", "rounded", "too_wide", "width"]
 
 PRECISE = 0.1
 """Coefficient of variation that is asked for by default."""
@@ -39,17 +39,22 @@ def more_runs(found: EstimationConclusion, n: int) -> str:
         more = f"about {rounded(total - n):,} more runs (budget: {total:,})"
         return f"{more}, which repeat combinations, give it to \N{PLUS-MINUS SIGN}20 % (95 %)"
     counted, known, narrow = found.counted or n, bool(found.probability), bool(found.probability) and width(found) <= 1.0
-    more = _runs_for_precision(counted * (too_wide(found) ** 2 - 1.0), n or counted, known=known, narrow=narrow)
-    return more + _as_many_draws(found, n)
+    return _runs_for_precision(counted * (too_wide(found) ** 2 - 1.0), n or counted, known=known, narrow=narrow)
 
 
-def _as_many_draws(found: EstimationConclusion, n: int) -> str:
-    """Return the advice to draw from the inputs' distribution alone, where the upper end would be much lower by as many runs."""
-    if n == 0 or not found.probability or found.probability >= 1.0:
+def as_many_draws(found: EstimationConclusion, n: int) -> str:
+    """Return the advice to draw from the inputs' distribution alone, where the interval of n such draws would be much narrower.
+
+    It is that of as many critical, and of as many failed ones, as the estimate expects of them.
+    """
+    if n == 0 or found.probability is None:
         return ""
-    crude = float(binomial.upper(math.ceil(n * found.probability), n, 0.5 * (1.0 + found.confidence)))
-    better = "; as many draws from the inputs' distribution would bound it better (acquisition: {kind: monte_carlo})"
-    return better if found.high > NO_BETTER * crude else ""
+    value = min(max(found.probability, 0.0), 1.0)
+    worst, tail = max(found.failed_as_critical or 0.0, value), 0.5 * (1.0 + found.confidence)
+    low, high = float(binomial.lower(n * value, n, tail)), float(binomial.upper(min(n * worst, n), n, tail))
+    if found.high <= NO_BETTER * high and found.high - found.low <= NO_BETTER * (high - low):
+        return ""
+    return "; as many draws from the inputs' distribution would bound it better (acquisition: {kind: monte_carlo})"
 
 
 def _runs_for_precision(more: float, made: int, *, known: bool, narrow: bool = False) -> str:

@@ -25,7 +25,7 @@ from sbt.campaigns.lost import (
     why_they_fail,
 )  # fmt: skip
 from sbt.campaigns.modes import most_often, single
-from sbt.campaigns.precision import NO_BETTER, PRECISE, always_agree, more_runs, rounded, too_wide
+from sbt.campaigns.precision import NO_BETTER, PRECISE, always_agree, as_many_draws, more_runs, rounded, too_wide
 from sbt.campaigns.reconciling import denial, ends, reconciled
 from sbt.campaigns.records import CONFIRM
 from sbt.campaigns.sides import all_critical, met, safe_runs
@@ -274,7 +274,8 @@ def tell_estimation(found: EstimationConclusion, facts: Facts) -> list[str]:
             said = f"The probability of {subject} is at least {number(found.low, 3)} ({confidence} interval to 1)"
         silent = _not_told(found, facts, every)
     every_one = "" if found.drawn_combinations else _every_combination(facts)
-    return [f"{verdict}{said}{rests}.", f"{silent}.", f"Next: {every_one}{_after_estimation(found, facts)}."]
+    better = as_many_draws(found, len(facts.history))
+    return [f"{verdict}{said}{rests}.", f"{silent}.", f"Next: {every_one}{_after_estimation(found, facts)}{better}."]
 
 
 def _combinations(found: EstimationConclusion) -> str:
