@@ -10,6 +10,7 @@ from sbt.campaigns.each import each_share, shares_words
 from sbt.campaigns.explained import ExplainedVariance, explained_variance
 from sbt.campaigns.lost import none_gave_a_metric, nothing_known
 from sbt.campaigns.parts import BatchStage, CriticalShare, critical_share
+from sbt.campaigns.rows import tell_rows
 from sbt.campaigns.settings import CampaignKind, Settings
 from sbt.campaigns.telling import tell_share
 from sbt.campaigns.warmed import conditional_on
@@ -34,6 +35,7 @@ class CoverageConclusion:
         validation: scores of the metamodel on held-out runs, where one is configured.
         requirements: of a combination, the share that violates each.
         explained: what inputs and drawn traffic explain of the metric; None: it is not known.
+        rows: of a recorded table whose rows are not spread evenly: the shares are of these rows, not of the parameter space.
     """
 
     critical_fraction: float | None
@@ -44,6 +46,7 @@ class CoverageConclusion:
     validation: Validation | None = optional()
     requirements: Mapping[str, CriticalShare] | None = optional()
     explained: ExplainedVariance | None = optional()
+    rows: int | None = optional()
 
     def to_dict(self) -> Json:
         """Return the JSON of the command line."""
@@ -57,7 +60,8 @@ class CoverageConclusion:
         told = [] if self.explained is None else [self.explained.sentence(facts.requirement.told_as)]
         lost = int((~facts.history.ok).sum())
         whole = CriticalShare(self.critical_fraction, self.low, self.high, self.confidence, self.counted, lost)
-        return [*tell_share(whole, facts), *shares_words(self.requirements), *conditional_on(facts.history), *told]
+        first = tell_share(whole, facts) if self.rows is None else tell_rows(whole, self.rows, facts)
+        return [*first, *shares_words(self.requirements), *conditional_on(facts.history), *told]
 
 
 def recipe(settings: Settings) -> Campaign:
@@ -66,10 +70,12 @@ def recipe(settings: Settings) -> Campaign:
     def conclude(log: Log) -> tuple[CoverageConclusion, FittedMetamodel | None]:
         fitted = settings.learner.fit(log.history) if settings.learner is not None else None
         share = critical_share(log.history, settings.scenario)
+        pool = settings.scenario.pool
         validation = None if fitted is None else fitted.record.validation
         found = CoverageConclusion(
             share.critical_fraction, share.low, share.high, share.confidence, share.counted, validation,
             each_share(log.history, settings.scenario.requirement), explained_variance(settings, log.history),
+            len(pool.x) if pool is not None and settings.scenario.uneven else None,
         )  # fmt: skip
         return found, fitted
 

@@ -100,7 +100,8 @@ class FalsificationConclusion:
         runs_to_first: how many runs of the search it took, from 1.
         critical_runs: of the search; confirmations are not counted.
         failure_modes: the deepest first; of a noisy simulator in the order of failure rates (`rates.local_rates`).
-        bound: where nothing critical was found, what the space-filling runs say about the critical share of the box.
+        bound: where nothing critical was found, what the space-filling runs say about the critical share of the box; None also of
+            recorded rows that are not spread evenly.
         closest: where nothing critical was found, the run nearest to the critical interval.
         statement: what follows from the runs, and no more.
         validation: scores of the metamodel on held-out runs; None without such runs.
@@ -257,7 +258,7 @@ class FailureSearch:
             modes.append(describe(mode, known, scenario, again, noisy=self.noisy(history)))
         left, stand_for = self.ways_to_ask(log), [mode.representative for mode in modes]
         first, inputs = int(hits[0]) if len(hits) else None, self.critical_inputs(searched)
-        bound = None if len(hits) else SearchBound.of(searched)
+        bound = None if len(hits) or scenario.uneven else SearchBound.of(searched)
         return FalsificationConclusion(
             None if first is None else int(searched.index[first]), None if first is None else first + 1, len(hits), tuple(modes),
             bound, None if len(hits) else _closest(searched, margin, scenario.requirement),
@@ -325,6 +326,8 @@ def _statement(runs: History, hits: int, inputs: int, modes: list[FailureMode], 
             f"No critical run in {n}. The guided runs bound nothing; from the {bound.space_filling_runs} space-filling ones"
             f" alone{how}, at most {100 * share:.3g} % of the box is critical (95 %).{hidden}"
         )
+    if hits == 0:
+        return f"No critical run in {n}. Rows that are not spread evenly over the box bound nothing.{hidden}"
     if hits == n - failed:
         return f"Every run that gave a metric was critical ({hits}): no boundary was met.{hidden}"
     unsure = [m for m in modes if m.confirmed is not None and _uncritical(m.confirmed, m)]

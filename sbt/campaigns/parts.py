@@ -119,6 +119,8 @@ class BatchStage:
             moved = [changed_share(a, b) for a, b in pairwise(sides)]
             if max(moved) < stable and _both_sides_known(log, s.scenario, stable):
                 return "stable"
+        if s.scenario.uneven:
+            return None  # its rows tell nothing of what the metamodel excludes
         return "misclassified" if self._sure(chose[-2:], log) else None
 
     def _sure(self, fits: Sequence[FitRecord], log: Log) -> bool:
@@ -192,9 +194,12 @@ def _chose(log: Log) -> list[FitRecord]:
 
 
 def _both_sides_known(log: Log, scenario: LogicalScenario, target: float) -> bool:
-    """Return whether several runs tell of each side, or those that fill space bound what is missing by so much of it."""
+    """Return whether several runs tell of each side, or those that fill space bound what is missing by so much of it.
+
+    Recorded rows that are not spread evenly bound nothing.
+    """
     even, facts = log.history.where(space_filling(log)), Facts.of(log.history, scenario)
-    bounded = (none_critical(facts) or all_critical(facts)) and bool(upper(0, len(even), _SURE) <= target)
+    bounded = not facts.uneven and (none_critical(facts) or all_critical(facts)) and bool(upper(0, len(even), _SURE) <= target)
     return bounded or not few_of_a_side(facts, pairs=bool(log.fits and log.fits[-1].over_traffic))
 
 

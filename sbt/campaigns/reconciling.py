@@ -37,14 +37,17 @@ def denial(found: BoundaryConclusion, runs: CriticalShare) -> str:
     return "" if whose is None else f" The {whose} deny its figures (below): do not rely on it yet."
 
 
-def reconciled(found: BoundaryConclusion, runs: CriticalShare, learned: int, *, recorded: bool = False) -> list[str]:
+def reconciled(
+    found: BoundaryConclusion, runs: CriticalShare, learned: int, *, recorded: bool = False, uneven: str = ""
+) -> list[str]:
     """Return the critical share by the metamodel and by the held-out runs alone, whether they agree, and what runs deny.
 
-    Recorded rows that are left over were not drawn at random: they check no share.
+    Recorded rows that are left over were not drawn at random: they check no share; `uneven` ones deny no certainty, either, as
+    there may be more of them where the metamodel is unsure.
     """
     if recorded:
         said = f"The metamodel takes {percent(found.critical_fraction or 0.0)} of the parameter space to be critical."
-        return [said, *_too_sure(found)]
+        return [said, *([] if uneven else _too_sure(found))]
     return [*_by_held_out(found, runs, learned), *_unlike_even(found), *_too_sure(found)]
 
 

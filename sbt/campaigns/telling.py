@@ -52,6 +52,7 @@ def tell_share(share: CriticalShare, facts: Facts) -> list[str]:
     if share.critical_fraction is None:
         return nothing_known(facts)
     where, runs, lost = _of(facts), plural(share.counted, "run"), share.lost or 0
+    runs += " taken to be" if facts.recorded else ""
     space = f"what gives a metric in the parameter space{where}" if lost else f"the parameter space{where}"
     said = f"{percent(share.critical_fraction)} of {space} is critical ({_condition(facts)}; {ends(share)})"
     if share.critical_fraction == 0.0:
@@ -113,14 +114,14 @@ def tell_boundary(found: BoundaryConclusion, measured_share: CriticalShare, fact
     rests = f"the metamodel learned that from {plural(learned, 'run')}{f' and {found.earlier} earlier' if found.earlier else ''}"
     missing = "an uncritical" if all_critical(facts) else "a critical"
     said = [
-        f"{lead}; {rests}, and {sure}.{denial(found, measured_share)}",
+        f"{lead}; {rests}, and {sure}.{'' if facts.uneven else denial(found, measured_share)}",
         f"This does not tell how probable critical runs are in traffic, since every part of the ranges counts the same; {missing}"
         f" region smaller than the gaps between {plural(learned, 'run')} may be missing from it.",
         f"Next: {_every_combination(facts)}{_after_boundary(found, facts, tested=tested)}.",
     ]
     if lines:
         said.append(f"On lines across the boundary, a run is critical where {lines}.")
-    return [*said, *reconciled(found, measured_share, learned, recorded=facts.recorded)]
+    return [*said, *reconciled(found, measured_share, learned, recorded=facts.recorded, uneven=facts.uneven)]
 
 
 def _after_boundary(found: BoundaryConclusion, facts: Facts, *, tested: bool) -> str:
@@ -212,6 +213,7 @@ def _nothing_found(found: FalsificationConclusion, facts: Facts) -> list[str]:
     searched = plural(len(facts.history), "run")
     said = f"The requirement{_of(facts)} was not falsified: none of {searched} was critical ({_condition(facts)})"
     silent = "This does not tell that there is no failure: guided runs bound nothing"
+    silent += ", nor do rows that are not spread evenly over the parameter space" if facts.uneven else ""
     further = "a larger budget"
     if bound is not None and bound.space_filling_runs:
         share = bound.box_fraction_failed_as_critical

@@ -111,15 +111,15 @@ def _figures(conclusion: Mapping[str, Any]) -> Any:
         return None
     table, ends = _table("", "", "95 % interval"), (conclusion.get("low"), conclusion.get("high"))
     held = conclusion.get("held_out_fraction") or {}
+    whose = {"critical_fraction": "critical share of the rows"} if conclusion.get("rows") else {}
     for name, key, value in rows:
 
         def written(value: float, key: str = key) -> str:
             return percent(value) if key in _SHARES else number(float(value), 3)
 
         low, high = ends if key in ("probability", "critical_fraction") else (None, None)
-        table.add_row(
-            name, written(float(value or 0.0)), "" if low is None or high is None else f"{written(low)} to {written(high)}"
-        )
+        between = "" if low is None or high is None else f"{written(low)} to {written(high)}"
+        table.add_row(whose.get(key, name), written(float(value or 0.0)), between)
     if held.get("critical_fraction") is not None:
         low, high = percent(held["low"]), percent(held["high"])
         table.add_row("the same by the held-out runs", percent(held["critical_fraction"]), f"{low} to {high}")

@@ -106,6 +106,7 @@ class Facts:
         meanings: of metrics, by name.
         recorded: its runs are recorded rows; there are no others.
         notes: in sentences, what is to be known of these rows.
+        uneven: why shares of these rows are none of the parameter space; "": they are, or runs are no rows.
     """
 
     history: History
@@ -117,6 +118,7 @@ class Facts:
     meanings: Mapping[str, str] = field(default_factory=dict)
     recorded: bool = False
     notes: tuple[str, ...] = ()
+    uneven: str = ""
 
     @classmethod
     def of(cls, history: History, scenario: LogicalScenario) -> Facts:
@@ -124,7 +126,7 @@ class Facts:
         return cls(
             history, scenario.requirement, scenario.unit, scenario.name, scenario.units, few_combinations(scenario),
             {m.name: m.description for m in scenario.metrics if m.description}, scenario.pool is not None,
-            notes_of(scenario),
+            notes_of(scenario), scenario.uneven,
         )  # fmt: skip
 
 
@@ -154,7 +156,10 @@ def sentences_of(conclusion: Conclusion, facts: Facts) -> list[str]:
 
 def notes_of(scenario: LogicalScenario) -> tuple[str, ...]:
     """Return in sentences what is to be known of the rows of a recorded table; nothing of a scenario that is run."""
-    return () if scenario.pool is None else scenario.pool.told(scenario.requirement)
+    if scenario.pool is None:
+        return ()
+    uneven = f"The rows are not spread evenly over the parameter space ({scenario.uneven}): shares of them are none of it."
+    return (*scenario.pool.told(scenario.requirement), *((uneven,) if scenario.uneven else ()))
 
 
 def few_combinations(scenario: LogicalScenario) -> int | None:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Protocol, runtime_checkable
 
 from sbt.errors import InputError, RunError, did_you_mean, must_be, must_take
+from sbt.problem.evenness import spread_evenly
 from sbt.problem.metric import Metric, meaningful, metric_from
 from sbt.problem.outcome import Status
 from sbt.problem.parameter import Parameter
@@ -207,6 +209,15 @@ class LogicalScenario:
         if self.evaluate is not None and not need.combined and need.critical.one_sided and need.critical.outward < 0.0:
             return "high"
         return next((m.direction for m in self.metrics if m.name == need.metric), "low")
+
+    @cached_property
+    def uneven(self) -> str:
+        """Why shares of a recorded table's rows are none of the space; "" where rows are spread evenly, or any run can be had."""
+        if self.pool is None:
+            return ""
+        if self.pool.guided:
+            return "they were chosen otherwise"
+        return "" if spread_evenly(self.space, self.pool.x) else "they crowd in parts of it"
 
     @property
     def isolations(self) -> tuple[str, ...]:

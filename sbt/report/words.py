@@ -69,6 +69,7 @@ class Findings:
         meanings: of metrics, by name.
         recorded: its runs are recorded rows.
         notes: in sentences, what is to be known of these rows.
+        uneven: why shares of them are none of the parameter space; "": they are.
     """
 
     history: History
@@ -86,6 +87,7 @@ class Findings:
     meanings: Mapping[str, str] = field(default_factory=dict)
     recorded: bool = False
     notes: tuple[str, ...] = ()
+    uneven: str = ""
 
     @classmethod
     def of(
@@ -100,7 +102,7 @@ class Findings:
             validation, store.counts.get(PLANNED, 0), scenario.direction,
             scenario.units, scenario.name, few_combinations(scenario),
             {m.name: m.description for m in scenario.metrics if m.description}, scenario.pool is not None,
-            notes_of(scenario),
+            notes_of(scenario), scenario.uneven,
         )  # fmt: skip
 
     @property
@@ -118,7 +120,7 @@ class Findings:
         """What the conclusion's own sentences may refer to."""
         return Facts(
             self.history, self.requirement, self.unit, self.scenario, self.units, self.combinations, self.meanings, self.recorded,
-            self.notes,
+            self.notes, self.uneven,
         )  # fmt: skip
 
 

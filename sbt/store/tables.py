@@ -1,8 +1,9 @@
 """Recorded outcomes as a scenario: `table:FOLDER`, in the layout of the public DSIOD data set.
 
 The folder holds `config.yml` (inputs with type, unit, min, max and explanation; outputs with unit; beyond the data set's own
-keys, `requirement` as in a configuration, and `logarithmic` of an input) and one table of rows, parquet or csv. A campaign on
-it chooses among the recorded rows instead of simulating, and is scored on all rows that it has not chosen.
+keys, `requirement` as in a configuration, `logarithmic` of an input, and `spread_evenly: false` where rows were not chosen to
+fill the space) and one table of rows, parquet or csv. A campaign on it chooses among the recorded rows instead of simulating,
+and is scored on all rows that it has not chosen.
 
 Source:
     Driving Scenario Input Output Dataset, Winkelmann et al. (2022), appendix of
@@ -36,6 +37,8 @@ from sbt.store.stated import stated_requirement, written_requirement
 __all__ = ["from_folder", "to_folder"]
 
 _SUFFIXES = (".parquet", ".csv")
+_ROUNDING = 1e-6
+"""How far a row may lie outside of its range, of the range: it was written with fewer digits."""
 _SEED = "seed"
 """Column that tells repeats of inputs from copies of a row, where it is no input and no output."""
 
@@ -60,6 +63,7 @@ def from_folder(name: str, folder: Path) -> LogicalScenario:
     inputs, outputs = described.get("inputs", {}), described.get("outputs", {})
     choices = {name: entry["choices"] for name, entry in inputs.items() if _has_choices(entry)}
     rows = _read(table, choices)
+    _told_apart(inputs, outputs, f"{table.parent / 'config.yml'}: ")
     missing = [column for column in [*inputs, *outputs] if column not in rows]
     if missing or not inputs or not outputs:
         absent = ", ".join(missing) or "all"
@@ -73,7 +77,10 @@ def from_folder(name: str, folder: Path) -> LogicalScenario:
     notes = (*notes, *(note for _, note in read if note))
     assumed = Requirement(next(iter(outputs)), high=0.0) if described.get("requirement") is None else None
     need = assumed or stated_requirement(described["requirement"], outputs, table.parent / "config.yml")
-    pool = Pool(x, {column: rows[column][kept] for column in outputs}, notes, assumed)
+    even = described.get("spread_evenly")
+    if even not in (None, True, False):
+        raise InputError(f"{table.parent / 'config.yml'}: spread_evenly must be true or false, but got {even!r}")
+    pool = Pool(x, {column: rows[column][kept] for column in outputs}, notes, assumed, guided=even is False)
     title, text = str(described.get("title", path.name)), str(described.get("logical_scenario", ""))
     return LogicalScenario(
         name=f"table:{name}", space=space, requirement=need,
@@ -115,7 +122,17 @@ class _Lookup:
         return {name: float(column[row]) for name, column in self._pool.metrics.items()}
 
 
-def to_folder(history: History, scenario: LogicalScenario, folder: Path, suffix: str = ".csv") -> Path:
+def _told_apart(inputs: Iterable[str], outputs: Iterable[str], where: str = "") -> None:
+    """Raise where a name is that of an input and of an output: the table has but one column of it."""
+    both = [name for name in inputs if name in set(outputs)]
+    if both:
+        rule = "a table of the data set's layout must tell inputs from outputs by name"
+        raise InputError(f"{where}{rule}, but both have '{both[0]}': rename one of them")
+
+
+def to_folder(
+    history: History, scenario: LogicalScenario, folder: Path, suffix: str = ".csv", *, spread_evenly: bool = True
+) -> Path:
     """Write the finished runs in the data set's layout: `config.yml` and one table.
 
     Args:
@@ -123,15 +140,20 @@ def to_folder(history: History, scenario: LogicalScenario, folder: Path, suffix:
         scenario: describes inputs and outputs.
         folder: is made where it is missing.
         suffix: `.csv`, or `.parquet` where pyarrow is installed.
+        spread_evenly: no run was chosen otherwise than to fill the parameter space.
 
     Returns:
         The table's file; `from_folder` reads the folder back to the same rows. Its column `seed` tells repeats of inputs from
         copies of a row; it is left out where an input or a metric has that name.
+
+    Raises:
+        InputError: an input has the name of a metric.
     """
     import pandas as pd
     from ruamel.yaml import YAML
 
     done = history.where(history.ok)
+    _told_apart(done.names, done.metrics)
     units = {metric.name: metric.unit for metric in scenario.metrics}
     title, _, text = scenario.description.partition("\n")
     described = {
@@ -144,6 +166,7 @@ def to_folder(history: History, scenario: LogicalScenario, folder: Path, suffix:
         } for p in scenario.space.parameters},
         "outputs": {name: {"type": "continuous", "unit": units.get(name, "")} for name in done.metrics},
         "requirement": written_requirement(scenario.requirement),
+        **({} if spread_evenly and not scenario.uneven else {"spread_evenly": False}),
     }  # fmt: skip
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "config.yml").open("w", encoding="utf-8") as file:
@@ -224,7 +247,11 @@ def _parameter(name: str, entry: Mapping[str, Any], column: Vector) -> tuple[Par
         unit, text = str(entry.get("unit", "")), str(entry.get("explanation", ""))
         return Parameter(name, unit=unit, description=text, choices=entry["choices"]), ""
     low, high = sorted((float(entry.get("min", column.min())), float(entry.get("max", column.max()))))
-    low, high = min(low, float(column.min())), max(high, float(column.max()))
+    least, most = float(column.min()), float(column.max())
+    if max(low - least, most - high) > _ROUNDING * max(high - low, abs(low), abs(high)):
+        rule = f"input {name}: all rows must lie between min and max of config.yml, {low:g} to {high:g}"
+        raise InputError(f"{rule}, but some lie from {least:g} to {most:g}: mend the rows, or the range")
+    low, high = min(low, least), max(high, most)
     whole = str(entry.get("type", "continuous")) in ("integer", "discrete") and bool((column % 1 == 0).all())
     found = Parameter(
         name, low, high, str(entry.get("unit", "")), kind="integer" if whole else "continuous",

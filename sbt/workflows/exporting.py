@@ -7,12 +7,16 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sbt.acquisitions import even
+from sbt.campaigns.counting import NOMINAL, RANDOM
+from sbt.campaigns.failures import FILLING
 from sbt.campaigns.preventable import with_judgements
+from sbt.campaigns.records import CONFIRM
 from sbt.errors import InputError, did_you_mean
 from sbt.files import as_cell, write_atomically
 from sbt.plugins import Objects
 from sbt.store.database import Store
-from sbt.store.history import named_columns
+from sbt.store.history import History, named_columns
 from sbt.workflows.status import read_status
 from sbt.workflows.study import Study
 
@@ -102,7 +106,19 @@ def _as_data_set(store: Store, study: Study) -> Path:
     """Write the runs in the layout of the public data set, which `table:FOLDER` reads."""
     from sbt.store.tables import to_folder
 
-    return to_folder(store.history(), study.scenario, store.folder / "exports" / "dsiod")
+    history = store.history()
+    filled = _fill_space(history, study)
+    return to_folder(history, study.scenario, store.folder / "exports" / "dsiod", spread_evenly=filled)
+
+
+def _fill_space(history: History, study: Study) -> bool:
+    """Return whether all runs were chosen to fill the parameter space, whatever the results."""
+    fill = set(FILLING)
+    if study.settings.acquisition is even:
+        fill |= set(history.stage.tolist()) - {CONFIRM}
+    if all(parameter.distribution is None for parameter in study.scenario.space.parameters):
+        fill |= {NOMINAL, RANDOM}
+    return fill.issuperset(history.stage.tolist())
 
 
 FORMS: Mapping[str, Callable[[Store, Study], Path]] = {
