@@ -8,6 +8,7 @@ import json
 import math
 import re
 import subprocess
+from importlib.resources import files
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -160,3 +161,11 @@ def test_a_browser_goes_from_a_point_to_its_film(tmp_path):
     assert "P(critical)" in told["slice"]
     assert told["markup"] == 1, "names are text: the only bold one is the head of what hovers"
     assert told["width"] <= 500, "nothing is wider than a narrow window, which is 500 wide at least without a screen"
+
+
+def test_every_text_of_a_figure_is_escaped_for_plotly():
+    """`<b>m</b>` as a unit was drawn bold on the axes of the parallel coordinates."""
+    written = files("sbt.report").joinpath("charts.js").read_text(encoding="utf-8")
+    named = re.findall(r"(?:label|text): ([^,}]*(?:titled|name)\([^,}]*)", written)
+    assert len(named) >= 3
+    assert all(each.startswith("safe(") for each in named), named

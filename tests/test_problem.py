@@ -552,3 +552,8 @@ def test_densities_of_inputs_over_decades_are_those_of_the_cube_where_draws_are_
     grid = np.linspace(0.0, 1.0, 20_001)[:, None]
     density = np.exp(lognormal.log_density_in_cube(grid)) * np.log(1e5)
     assert np.trapezoid(density, grid[:, 0]) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_a_misspelt_kind_of_distribution_is_told_the_nearest_name():
+    with pytest.raises(InputError, match=r"did you mean '?normal"):
+        Distribution.of("norml", mean=0, std=1)

@@ -295,3 +295,9 @@ def test_bare_signals_of_traffic_are_the_worst_over_all(name: str, tmp_path):
         requirement={"stl": "G[0,20](distance > 1)"},
     )  # fmt: skip
     assert (result.frame["status"] == "ok").all()
+
+
+def test_a_misspelt_signal_is_told_the_nearest_name():
+    for wrong, meant in (("gapp", "gap"), ("ego.sped", "speed")):
+        with pytest.raises(InputError, match=f"did you mean '?{meant}"):
+            check_signal(wrong)

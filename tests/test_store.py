@@ -613,3 +613,10 @@ def test_a_frame_has_the_columns_of_the_requirement_before_any_run_is_ok(tmp_pat
     either = sbt.any_of(sbt.Requirement("g", high=0.1), sbt.Requirement("h", low=3.0))
     assert done.history.to_frame(either)[["y.g", "y.h"]].isna().all(axis=None)
     assert list(done.history.where(np.zeros(4, dtype=bool)).to_frame(either)[["y.g", "y.h"]].dtypes) == [np.float64] * 2
+
+
+def test_a_store_below_a_link_to_nothing_is_refused_in_words(tmp_path):
+    """"File exists" was the reason."""
+    (tmp_path / "link").symlink_to("nowhere")
+    with pytest.raises(StoreError, match="link is a link to nowhere: not there"):
+        Store.open(tmp_path / "link" / "s", {})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 from typing import TYPE_CHECKING, Any
@@ -35,9 +36,12 @@ def main() -> None:
     from sbt.cli.console import process
     from sbt.cli.verbs import app
 
-    with process():
-        starting.active = False
-        app(prog_name="sumo-sbt")
+    try:
+        with process():
+            starting.active = False
+            app(prog_name="sumo-sbt")
+    finally:
+        gc.freeze()  # else the interpreter's end looks through all objects of all libraries, which takes seconds
 
 
 def __getattr__(name: str) -> Any:

@@ -15,6 +15,9 @@ from sbt.files import as_cell
 
 __all__ = ["metrics"]
 
+_OF_A_PAIR = ("ego", "other", "begin", "end")
+"""Columns of a pair; a metric of such a name is called `y.NAME`, as in exports."""
+
 
 def metrics(
     file: Annotated[
@@ -35,11 +38,11 @@ def metrics(
         from sbt.metrics.tracks import read_recording
 
         within = _within(pairs)
-        measured = catalogue()
+        measured = {f"y.{m.name}" if m.name in _OF_A_PAIR else m.name: m for m in catalogue()}
         recording = read_recording(file, length=length, width=width)
         rows = [
             {"ego": ego, "other": other, "begin": float(trace.time[0]), "end": float(trace.time[-1])}
-            | {metric.name: _value(metric, trace) for metric in measured}
+            | {name: _value(metric, trace) for name, metric in measured.items()}
             for ego, other, trace in encounters(recording, within)
         ]  # fmt: skip
     touching = sum(row.get("collision") == 1.0 for row in rows)
@@ -49,7 +52,7 @@ def metrics(
     if recording.assumed and rows:
         what = f"{recording.assumed} of {recording.kinds.count('vehicle')} vehicles have no length or width in '{file}'"
         print(f"note: {what}, and are taken for {length:g} m x {width:g} m (--length, --width)", file=sys.stderr)
-    columns = ["ego", "other", "begin", "end", *(metric.name for metric in measured)]
+    columns = [*_OF_A_PAIR, *measured]
     if out is not None:
         try:
             with out.open("w", newline="") as target:
@@ -57,7 +60,7 @@ def metrics(
         except OSError as error:
             raise InputError(f"--out must be a file that can be written, but got '{out}': {error.strerror}") from None
     if as_json:
-        units = {metric.name: metric.unit for metric in measured}
+        units = {name: metric.unit for name, metric in measured.items()}
         print_json({"file": str(file), "road_users": len(recording.names), "steps": len(recording.time),
                     "heights": recording.z is not None, "assumed_sizes": recording.assumed, "within": within, "units": units,
                     "pairs": rows})  # fmt: skip

@@ -31,7 +31,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from sbt.errors import InputError
+from sbt.errors import InputError, did_you_mean
 from sbt.metrics.braking import btn, drac, mdrac, mttc
 from sbt.metrics.comfort import jerk
 from sbt.metrics.longitudinal import Signal, encounter, gap, thw, ttc
@@ -83,7 +83,8 @@ def check_signal(name: str) -> None:
         if dot and not actor:
             raise InputError(f"a signal must be NAME or actor.NAME, but got '{name}'")
         return
-    raise InputError(f"a signal must be one of time, {', '.join((*PAIR_SIGNALS, *ACTOR_SIGNALS))}, but got '{name}'")
+    known = ("time", *PAIR_SIGNALS, *ACTOR_SIGNALS)
+    raise InputError(f"a signal must be one of {', '.join(known)}, but got '{name}'{did_you_mean(what, known)}")
 
 
 def signal(trace: Trace, name: str, ego: str = "ego", other: str = "co", margin: float = 0.0) -> Vector:

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from sbt.errors import InputError, must_be
+from sbt.errors import InputError, did_you_mean, must_be
 from sbt.problem.arrays import Vector
 
 __all__ = [
@@ -89,8 +89,8 @@ class Distribution:
                 raise InputError(f"kind scipy needs the name of a continuous distribution of scipy.stats, but got {name}")
             return self._built(lambda: family(**given))
         if self.kind not in KINDS:
-            known = ", ".join([*KINDS, "scipy", "empirical"])
-            raise InputError(f"a distribution's kind must be one of {known}, but got '{self.kind}'")
+            known, hint = ", ".join((*KINDS, "empirical", "scipy")), did_you_mean(self.kind, (*KINDS, "empirical", "scipy"))
+            raise InputError(f"a distribution's kind must be one of {known}, but got '{self.kind}'{hint}")
         names, build = KINDS[self.kind]
         if set(given) != set(names):
             raise InputError(

@@ -55,13 +55,12 @@ const drawScatter = (place, data, view) => {
 // evenly: first of the critical ones, which lie on top.
 const LINES = 3000, CROSSINGS = 24000;  // a browser without a graphics processor draws about 5,000 crossings of lines and axes a second
 const thinned = (rows, most) => rows.length <= most ? rows : Array.from({ length: most }, (_, k) => rows[Math.floor(k * rows.length / most)]);
+const drawable = data => [...data.index.keys()].filter(row => data.verdict[row] !== 2 && Number.isFinite(data.told.values[row]));
 const drawParallel = (place, data, view) => {
-  const all = [...data.index.keys()].filter(row => data.verdict[row] !== 2 && Number.isFinite(data.told.values[row]));
+  const all = drawable(data);
   const most = Math.min(LINES, Math.floor(CROSSINGS / (data.inputs.length + 1)));
   const critical = thinned(all.filter(row => data.verdict[row] === 1), Math.floor(most / 2));
   const rows = [...thinned(all.filter(row => data.verdict[row] === 0), most - critical.length), ...critical];
-  place.closest(".panel").hidden = !rows.length;
-  if (!rows.length) { place.textContent = "No run gave a number to draw."; return undefined; }
   place.dataset.lines = rows.length < all.length ? `Shown are ${rows.length} of ${all.length} runs; ranges filter all.` : "";
   const columns = [data.told, ...data.ranked];
   const dimensions = columns.map(column => {
@@ -72,7 +71,7 @@ const drawParallel = (place, data, view) => {
     const decades = column.log ? Array.from({ length: Math.floor(high) - Math.ceil(low) + 1 }, (_, k) => Math.ceil(low) + k) : [];
     const named = column.log && decades.length > 1 ? { tickvals: decades, ticktext: decades.map(k => `1e${k}`) }
       : column.log ? { tickvals: [low, high], ticktext: [low, high].map(at => digits(10 ** at, 2)) } : column.choices.length ? { tickvals: column.choices.map((_, k) => k), ticktext: column.choices.map(c => shortened(c, 12)) } : {};
-    return { label: shortened(titled(column), 18), values, range: [low, high], constraintrange: brushed(column, view.brushes.get(column.name), Math.log10), ...named };
+    return { label: safe(shortened(titled(column), 18)), values, range: [low, high], constraintrange: brushed(column, view.brushes.get(column.name), Math.log10), ...named };
   });
   const [safeColour, criticalColour] = shades();
   place.style.minWidth = `${96 * columns.length}px`;

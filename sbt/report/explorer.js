@@ -67,6 +67,11 @@ class Explorer {
     const place = this.part("parallel");
     this.parallel = true;
     if (this.watch) this.watch.disconnect();
+    this.watch = null;
+    const none = !drawable(this.data).length;
+    if (none || place.dataset.none) place.textContent = none ? "No run gave a number to draw." : "";
+    place.dataset.none = none ? "none" : "";
+    if (none) return;
     this.watch = new IntersectionObserver(seen => { if (seen.some(each => each.isIntersecting)) this.parallelNow(); }, { rootMargin: "300px" });
     this.watch.observe(place);
   }

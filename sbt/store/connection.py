@@ -24,8 +24,12 @@ def with_room(folder: Path) -> Path:
     """Return a folder whose path, without links, is short enough for SQLite to open a file in it.
 
     Raises:
-        StoreError: it is too long.
+        StoreError: it is too long, or leads through a link to nothing.
     """
+    broken = next((part for part in (folder, *folder.parents) if part.is_symlink() and not part.exists()), None)
+    if broken is not None:
+        what = f"{broken} is a link to {broken.readlink()}: not there"
+        raise StoreError(f"the path of a store must lead somewhere, but in {folder} {what}")
     there = Path(os.path.realpath(folder))
     excess = len(os.fsencode(there / DATABASE)) - _LONGEST
     if os.name == "posix" and excess > 0:

@@ -40,6 +40,7 @@ MODEL = "metamodel.sbtmodel"
 """In the folder of a store: the metamodel that was fitted last by `predict`."""
 _CHUNK = 4096
 _TOLERANCE = 1e-9
+_PREDICTIONS = ("mu", "sigma", "epistemic", "noise", "p_critical", "p_fails")
 _MOST_TOLD = 5
 """Wrong cells of a table that are told, each on a line."""
 
@@ -73,14 +74,16 @@ class Table:
         """Return one mapping a row: inputs, choices as text, then predictions."""
         values = np.column_stack(list(self.columns.values()))
         return [
-            {**self.space.named(x), **dict(zip(self.columns, map(float, row), strict=True))}
+            {**dict(zip(self.inputs, self.space.named(x).values(), strict=True)),
+             **dict(zip(self.columns, map(float, row), strict=True))}
             for x, row in zip(self.x, values, strict=True)
-        ]
+        ]  # fmt: skip
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Names of the inputs."""
-        return self.space.names
+        """Names of the inputs; all are `x.NAME` where one has the name of a prediction, be it made or not."""
+        names = self.space.names
+        return names if {*_PREDICTIONS, *self.columns}.isdisjoint(names) else tuple(f"x.{name}" for name in names)
 
 
 def predict_rows(folder: Path, inputs: Path, device: str | None = None) -> Table:
@@ -133,7 +136,7 @@ def predict_inputs(
         told = ended(p)
         parts.append([told.mu, told.sigma, told.epistemic, told.noise, p.probability(requirement.critical), *single])
     each_of = requirement.parts if requirement.combined else ()
-    names = ("mu", "sigma", "epistemic", "noise", "p_critical", *(f"p_critical.{part.label}" for part in each_of))
+    names = (*_PREDICTIONS[:5], *(f"p_critical.{part.label}" for part in each_of))
     columns = dict(zip(names, np.concatenate(parts, axis=1), strict=True)) if parts else {n: np.empty(0) for n in names}
     if (success := learner.success(history)) is not None:
         columns["p_fails"] = -np.expm1(success(space.to_unit(x)))
