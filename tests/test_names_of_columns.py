@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import re
 
 import numpy as np
 import pytest
@@ -63,3 +64,18 @@ def test_no_prediction_is_written_over_an_input_of_its_name(tmp_path, name):
     (first, _) = json.loads(done.stdout)["rows"]
     assert list(first) == head
     assert (first["x.gap"], first[f"x.{name}"]) == (0.25, 2.5)
+
+
+def test_an_input_and_a_metric_of_one_name_keep_their_units(tmp_path):
+    """Inputs called `speed`, in km/h, were told in the m/s of the metric `speed`."""
+    scenario = sbt.Scenario(
+        "s", [sbt.Parameter("speed", 0, 100, "km/h")], sbt.Requirement("speed", low=20.0),
+        evaluate=lambda x, seed: {"speed": x["speed"] / 3.6}, metrics={"speed": "m/s"},
+    )  # fmt: skip
+    found = sbt.run(
+        campaign="boundary", scenario=scenario, budget=30, initial=30, metamodel={"kind": "gp"}, executor="serial",
+        store=tmp_path / "s", report=False,
+    )  # fmt: skip
+    said = found.sentences()[0]
+    assert "speed ≥ 20 m/s" in said
+    assert re.search(r"above 7\d\.?\d* km/h", said), said

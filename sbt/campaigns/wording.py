@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 
 from sbt.problem.combination import CombinedRequirement
+from sbt.problem.plain import unit_of
 from sbt.problem.requirement import Requirement
 from sbt.store.history import History
 
 __all__ = [
     "NOTHING", "digits_of", "estimating", "input_value", "input_widths", "measured", "mixture_shares", "narrow_digits",
-    "number", "percent", "plural", "requirement_words", "widening", "written_unit",
+    "number", "percent", "plural", "requirement_words", "unit_of", "widening", "written_unit",
 ]  # fmt: skip
 
 _NIL = 1e-30  # a rounding error of what is zero
@@ -129,7 +130,7 @@ def requirement_words(requirement: Requirement, unit: str, units: Mapping[str, s
     """Return when a run is critical; `units` by metric are those of a combination's."""
     if isinstance(requirement, CombinedRequirement):
         joint, units = " or " if requirement.how == "any" else " and ", units or {}
-        said = [requirement_words(item, units.get(item.metric, ""), units) + _called(item) for item in requirement.items]
+        said = [requirement_words(item, unit_of(units, item.metric), units) + _called(item) for item in requirement.items]
         nested = (isinstance(item, CombinedRequirement) for item in requirement.items)
         return joint.join(f"({words})" if inner else words for words, inner in zip(said, nested, strict=True))
     low, high, name = requirement.critical.low, requirement.critical.high, requirement.metric

@@ -77,16 +77,19 @@ def _answer(result: Mapping[str, Any]) -> list[str]:
 
 def _mode(mode: Mapping[str, Any], metric: str, units: Mapping[str, str]) -> str:
     """Return a failure mode on one line."""
-    from sbt.campaigns.wording import input_value, plural
+    from sbt.campaigns.wording import input_value, plural, unit_of
 
-    def measured(name: str, value: Any) -> str:
-        return f"{name} {_short(value)} {_unit(units.get(name, ''))}".rstrip()
+    def measured(name: str, value: Any, unit: str) -> str:
+        return f"{name} {_short(value)} {_unit(unit)}".rstrip()
 
     inputs, digits = list(mode["inputs"].items()), mode.get("digits") or {}
-    told = [measured(name, input_value(value, digits=digits.get(name, 3))) for name, value in inputs[:_MOST_INPUTS]]
+    told = [
+        measured(name, input_value(value, digits=digits.get(name, 3)), units.get(name, ""))
+        for name, value in inputs[:_MOST_INPUTS]
+    ]
     if len(inputs) > _MOST_INPUTS:
         told.append(f"and {plural(len(inputs) - _MOST_INPUTS, 'more input')}")
-    said = [f"run {mode['representative']}, {measured(metric, mode['metric'])}, at {', '.join(told)}"]
+    said = [f"run {mode['representative']}, {measured(metric, mode['metric'], unit_of(units, metric))}, at {', '.join(told)}"]
     for name, found in (mode.get("choices") or {}).items():
         said.append(f"also with {name} {' or '.join(choice for choice in found if choice != mode['inputs'][name])}")
     said += [str(mode["conflict"])] if mode.get("conflict") else []

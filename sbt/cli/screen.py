@@ -65,12 +65,12 @@ def _table(*columns: str) -> Any:
 
 def _modes(result: Mapping[str, Any], width: int) -> Any:
     """Return the table of failure modes, with as many inputs as there is room for."""
-    from sbt.campaigns.wording import input_value, number, written_unit
+    from sbt.campaigns.wording import input_value, number, unit_of, written_unit
 
     modes, units = result["conclusion"]["failure_modes"], result.get("units", {})
 
-    def head(name: str) -> str:
-        unit = written_unit(units.get(name, ""))
+    def head(name: str, unit: str) -> str:
+        unit = written_unit(unit)
         return f"{name}\n{unit}" if unit else name
 
     names, room = [], width - _BESIDE - len(result["metric"])
@@ -80,7 +80,8 @@ def _modes(result: Mapping[str, Any], width: int) -> Any:
         if room < 0:
             break
         names.append(name)
-    table = _table("mode", "run", head(result["metric"]), *map(head, names), "critical\nruns", "critical\nagain")
+    told = (head(result["metric"], unit_of(units, result["metric"])), *(head(name, units.get(name, "")) for name in names))
+    table = _table("mode", "run", *told, "critical\nruns", "critical\nagain")
     for k, mode in enumerate(modes, start=1):
         again, n, digits = mode.get("confirmed"), mode.get("confirmation_runs", 0), mode.get("digits") or {}
         inputs = [input_value(mode["inputs"][name], digits=digits.get(name, 3)) for name in names]

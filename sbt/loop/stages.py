@@ -10,7 +10,7 @@ from typing import Protocol, TypeVar, runtime_checkable
 from sbt.errors import InputError
 from sbt.loop.learner import FittedMetamodel
 from sbt.problem.outcome import Doubt
-from sbt.problem.plain import Json
+from sbt.problem.plain import Json, unit_of
 from sbt.problem.pool import Pool
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
@@ -149,7 +149,7 @@ def sentences_of(conclusion: Conclusion, facts: Facts) -> list[str]:
     if said and dead:
         which = f"In {dead:,} of {len(facts.history):,} runs another road user brakes as no vehicle can"
         said = [*said, f"{which} (column unconfirmed); SUMO lets one do so before a red light or where its lane ends."]
-    bare = [part.metric for part in facts.requirement.parts if not facts.units.get(part.metric)]
+    bare = [part.metric for part in facts.requirement.parts if not unit_of(facts.units, part.metric)]
     meant = [f"{metric}: {facts.meanings[metric]}." for metric in bare if metric in facts.meanings]
     return said and [*said, *meant, *facts.notes]
 

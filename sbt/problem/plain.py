@@ -8,7 +8,7 @@ from typing import Any
 
 from sbt.errors import InputError
 
-__all__ = ["Json", "JsonMapping", "Value", "Values", "check_table", "written"]
+__all__ = ["Json", "JsonMapping", "Value", "Values", "check_table", "unit_of", "written"]
 
 Json = dict[str, Any]
 """A JSON object."""
@@ -44,3 +44,12 @@ def check_table(path: Path) -> None:
     if path.exists() and not 0 <= size <= LARGEST_TABLE:
         rule = f"a table must be a file of at most {LARGEST_TABLE // 2**20} MiB"
         raise InputError(f"{rule}, but '{path}' " + ("is none" if size < 0 else f"has {size // 2**20} MiB"))
+
+
+def unit_of(units: Mapping[str, str], metric: str, default: str = "") -> str:
+    """Return the unit of a metric among those of inputs and metrics by name, where an input may have its name.
+
+    >>> unit_of({"gap": "m", "y.gap": "s", "ttc": "s"}, "gap")
+    's'
+    """
+    return units.get(f"y.{metric}", units.get(metric, default))

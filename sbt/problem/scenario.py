@@ -196,8 +196,9 @@ class LogicalScenario:
 
     @property
     def units(self) -> dict[str, str]:
-        """Units of inputs and metrics, by name."""
-        return {p.name: p.unit for p in self.space.parameters} | {m.name: m.unit for m in self.metrics}
+        """Units of inputs and metrics, by name; of a metric with the name of an input as `y.NAME` (`unit_of`)."""
+        inputs = {p.name: p.unit for p in self.space.parameters}
+        return inputs | {f"y.{m.name}" if m.name in inputs else m.name: m.unit for m in self.metrics}
 
     @property
     def direction(self) -> str:

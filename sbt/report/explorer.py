@@ -18,7 +18,7 @@ from sbt.campaigns.failures import FalsificationConclusion
 from sbt.campaigns.modes import worst_first
 from sbt.campaigns.wording import digits_of
 from sbt.problem.parameter import Parameter
-from sbt.problem.plain import Json, JsonMapping
+from sbt.problem.plain import Json, JsonMapping, unit_of
 from sbt.problem.scenario import LogicalScenario
 from sbt.report.influence import Influence
 from sbt.report.projection import Predict
@@ -72,7 +72,7 @@ def explorer_data(
         "title": scenario.name, "told": requirement.told_as, "total": len(history), "critical_total": int(np.sum(critical)),
         "inputs": [_input(p, k, influence) for k, p in enumerate(scenario.space.parameters)],
         "metrics": [
-            {"name": m, "unit": found.units.get(m, ""), "critical": limits.get(m), "description": found.meanings.get(m, "")}
+            {"name": m, "unit": unit_of(found.units, m), "critical": limits.get(m), "description": found.meanings.get(m, "")}
             for m in history.metrics
         ],
         "weights": [float(f"{w:.4g}") for w in np.asarray(weights).tolist()],

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sbt.problem.arrays import Vector
+from sbt.problem.plain import unit_of
 from sbt.problem.space import ParameterSpace
 from sbt.report import curves, figures
 from sbt.report.convergence import drawing_of_convergence
@@ -267,7 +268,7 @@ def _counts(found: Findings) -> Iterator[Drawing]:
     if not found.history.ok.any():
         return
     for k, part in enumerate(found.requirement.parts):
-        unit = found.units.get(part.metric, found.unit)
+        unit = unit_of(found.units, part.metric, found.unit)
         figure = new_figure(5.4, 3.7)
         curves.plot_metric_histogram(found.history, part, figure.subplots(), unit=unit)
         caption = (

@@ -25,7 +25,7 @@ from sbt.config.load import load
 from sbt.errors import InputError, command_of
 from sbt.loop.stages import Progress
 from sbt.problem.arrays import Mask, Vector
-from sbt.problem.plain import Json
+from sbt.problem.plain import Json, unit_of
 from sbt.report.versus import write_versus
 from sbt.store.database import DATABASE, Store
 from sbt.store.history import History
@@ -270,7 +270,7 @@ def _check(one: Study, other: Study, paths: tuple[Path, Path]) -> None:
         found = f"{one.scenario.requirement} in {paths[0]}, {other.scenario.requirement} in {paths[1]}"
         raise InputError(f"compare-ego needs one requirement, but got {found}")
     for part in one.scenario.requirement.parts:
-        units = [study.scenario.units.get(part.metric, "") or "no unit" for study in (one, other)]
+        units = [unit_of(study.scenario.units, part.metric) or "no unit" for study in (one, other)]
         if units[0] != units[1]:
             there = f"in {units[0]} in {paths[0]}, in {units[1]} in {paths[1]}"
             raise InputError(f"compare-ego needs one requirement, but {part.metric} is {there}")

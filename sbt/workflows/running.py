@@ -67,7 +67,7 @@ class Summary:
         conclusion: what was found.
         sentences: the same in plain words.
         metric: that of the requirement, or what stands for it in a formula or a combination.
-        units: of inputs and metrics, by name.
+        units: of inputs and metrics, by name; of a metric with the name of an input as `y.NAME`.
         look_at: the run to look at first, as the sentences say; None: they name none.
     """
 
