@@ -12,7 +12,7 @@ from scipy.spatial.distance import cdist
 from scipy.special import gammaincinv, log_ndtr, ndtr
 from scipy.stats import binomtest, chi2
 
-from sbt.campaigns.pools import Frame, draw_pool, fit_proposal
+from sbt.campaigns.pools import Frame, draw_batch, draw_pool, fit_proposal
 from sbt.campaigns.stopping import spared
 from sbt.campaigns.teaching import select_teaching
 from sbt.estimators.binomial import interval, lower, upper
@@ -20,11 +20,17 @@ from sbt.estimators.choices import log_normal
 from sbt.estimators.events import FailingLogProbability, events
 from sbt.estimators.importance import BLIND, SHARES, draw_systematic, plan_batch, stated
 from sbt.estimators.intervals import FEWEST_HITS, CountedBatch, combine_estimates
-from sbt.estimators.mixture import Mixture, Near, Normals, fit_mixture, particles, wide_scales
+from sbt.estimators.mixture import Mixture, Near, Normals, fit_mixture, particles, wide_scales, within_reach
 from sbt.estimators.monte_carlo import Proportion
 from sbt.estimators.subset import SubsetRun, combine_repeats, has_levels, next_levels
 from sbt.estimators.subspace import find_subspace, inputs_that_matter
+from sbt.estimators.surrogate import JointLogProbability
 from sbt.metamodels.gaussian_process import GaussianProcess
+from sbt.problem.combination import all_of, any_of
+from sbt.problem.distribution import Normal, Triangular
+from sbt.problem.parameter import Parameter
+from sbt.problem.requirement import Requirement
+from sbt.problem.space import ParameterSpace
 from sbt.seeds import stream
 from sbt.testbeds import from_name
 
@@ -493,3 +499,57 @@ def test_subset_simulation_ends_on_a_plateau_and_without_a_run():
             repeat = repeat.tell(z, margin[: len(z)])
         assert repeat.finished
         assert repeat.share == 0.0
+
+
+class Denied:
+    """What a metamodel says of a metric that had one value in all runs: P of e^-1e6, and the more the farther out."""
+
+    def __init__(self, sign: int):
+        self.sign = sign
+
+    def __call__(self, z):
+        log_p = -1e6 / (1.0 + (z**2).sum(axis=1) / 100.0)
+        return (log_p, np.log1p(-np.exp(log_p)))[:: self.sign]
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("how", [any_of, all_of])
+def test_what_no_run_has_met_takes_no_share_of_a_pool(how, sign):
+    """A requirement that none, or every, run violates: its share of the pool ran off to normal scores of 3,000."""
+
+    def line(z):
+        return log_ndtr(5.0 * (z[:, 0] - 2.5)), log_ndtr(5.0 * (2.5 - z[:, 0]))
+
+    space = ParameterSpace(tuple(Parameter(name, -8.0, 8.0, "", Normal(0.0, 1.0)) for name in "ab"))
+    critical = how(Requirement("ttc", low=0.0), Requirement("impact", low=0.0)).critical
+    frame, hits = Frame(WIDE), np.array([[2.6, 0.0], [3.0, 1.0]])
+    for metamodel in (JointLogProbability(critical, (line, Denied(sign))), Denied(sign)):
+        proposal = fit_proposal(space, frame, metamodel, hits, SHARES, stream(1, "fit"))
+        pool = draw_pool(space, frame, proposal, SHARES, stream(1, "draw"))
+        normals = proposal.mixture.normals
+        assert normals is None or within_reach(normals.mean).all()
+        assert (pool.plan.weight > 0.0).mean() > 0.99
+        runs, kept = draw_batch(space, pool, 200, stream(1, "batch"), counts=True)
+        assert np.isfinite([run.log_q for run in runs]).all()
+        assert min(kept.counted.coefficient) > 0.0
+
+
+def test_points_without_density_are_never_drawn():
+    """Of weight 0, and where a score is the end of a range at which a triangle has none; they were, with log q = inf, or -inf."""
+    space = ParameterSpace((Parameter("a", 0.0, 10.0, "", Triangular(0.0, 3.0, 10.0)),))
+    frame = Frame(wide_scales(np.zeros(1)))
+    proposal = fit_proposal(space, frame, None, None, BLIND, stream(1, "fit"))
+    pool = draw_pool(space, frame, proposal, BLIND, stream(1, "draw"))
+    lost = ~np.isfinite(space.log_density(pool.x))
+    assert lost.any()
+    assert not pool.plan.probability[lost].any()
+    runs, _ = draw_batch(space, pool, 2000, stream(1, "batch"), counts=True)
+    assert np.isfinite([run.log_q for run in runs]).all()
+    flat, far = np.full(4, np.log(0.5)), np.array([0.0, -1.0, -800.0, -np.inf])
+    plan = plan_batch(flat, flat, far, np.zeros(4), np.zeros(4), others=((flat, flat),))
+    assert (plan.probability > 0.0).tolist() == [True, True, False, False]
+
+
+def test_draws_of_no_weight_are_neither_critical_nor_safe():
+    batch = CountedBatch(0.0, 0.1, 0.0, np.array([1.0, 0.0, 2.0, 0.0]), np.zeros(4), np.array([1.0, 1.0, 0.0, 0.0]))
+    assert (batch.hits, batch.misses) == (1, 1)

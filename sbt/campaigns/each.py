@@ -94,7 +94,7 @@ def _from_batches(log: Log, settings: Settings, confidence: float) -> tuple[Requ
         if not safe:
             return None
         low, high = combine_estimates(safe), combine_estimates(critical)
-        hits, misses = (int(sum((batch.critical == side).sum() for batch in safe)) for side in (1.0, 0.0))
+        hits, misses = sum(batch.hits for batch in safe), sum(batch.misses for batch in safe)
         few, value = min(hits, misses) < FEW_HITS, min(max(low.value, 0.0), 1.0)
         if min(hits, misses) == 0:  # no variance is known: the draws from the inputs' distribution bound it
             ends = _bounds(part, log, settings, tail)

@@ -20,10 +20,10 @@ from sbt.campaigns.teaching import select_teaching
 from sbt.estimators.choices import ChoiceScore, log_normal, log_wide
 from sbt.estimators.events import Event, events
 from sbt.estimators.importance import Draws, Plan, draw_systematic, plan_batch, stated
-from sbt.estimators.mixture import Mixture, Near, effective_size, fit_mixture, particles, reweighted
+from sbt.estimators.mixture import Mixture, Near, effective_size, fit_mixture, particles, reweighted, within_reach
 from sbt.estimators.surrogate import LogProbability, sketch_of
 from sbt.metamodels.joint import LogPair
-from sbt.problem.arrays import Points, Vector
+from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.space import ParameterSpace
 from sbt.store.database import PlannedRun
 
@@ -45,6 +45,8 @@ SKETCH = 600
 _REFITS, _REFIT_POINTS, _ENOUGH = 4, 3000, 0.15
 """How often the mixture is fitted again to its own points at most, how many they are, and the effective share of them that is
 enough: of a perfect fit four tenths would be."""
+_NOTHING = math.log(1e-9)
+"""Log of the largest P of an event, where particles went to look for it, with which no points are proposed for it."""
 _TRIES = 30
 """Draws of the inputs' distribution for a point of a pool at most, of which those within constraints are kept: where a
 three-hundredth is admissible a tenth of the pool can be such points, and less where less is."""
@@ -203,12 +205,19 @@ def _pooled(
     """Return the pool of the points that were drawn."""
     at, whole, parts = drawn.at, drawn.whole, drawn.parts
     z = frame.lift(at.v, rng) if at.z is None else at.z
+    x = space.from_normal(z)
+    log_w = np.where(_has_density(space, x), at.log_p - at.log_h, -np.inf)
     log_wide_ratio = log_wide(at.v, frame.wide, frame.choices) - at.log_h
     plan = plan_batch(
-        *whole.safe, at.log_p - at.log_h, log_wide_ratio, at.stratum, shares, form,
+        *whole.safe, log_w, log_wide_ratio, at.stratum, shares, form,
         others=tuple(event for event in (whole.critical, *(part.safe for part in parts)) if event is not None),
     )  # fmt: skip
-    return Pool(mixture, z, space.from_normal(z), plan, whole, parts, at.stratum)
+    return Pool(mixture, z, x, plan, whole, parts, at.stratum)
+
+
+def _has_density(space: ParameterSpace, x: Points) -> Mask:
+    """Return which inputs x (n, d) have a density: far out a score is the end of a range, where a triangle, say, has none."""
+    return np.all([np.isfinite(p.log_density(x[:, k])) for k, p in enumerate(space.parameters)], axis=0)
 
 
 def _fitted(
@@ -216,6 +225,8 @@ def _fitted(
 ) -> tuple[Mixture, _Drawn | None]:
     """Return h, fitted to particles of p pi and of p sqrt(pi (1 - pi)), and of what else is estimated; and points of h, if any.
 
+    What is next to impossible wherever the particles went is left out: of a requirement whose metric had one value in all runs a
+    metamodel says that it is the less impossible the farther out one looks, and a share of the pool would follow that.
     With many runs a sketch of the metamodel guides the particles; the mixture is then fitted again to points of its own, which
     the metamodel itself weights. Whether a point of a subspace is admissible the other coordinates say: there only the points
     that the mixture is fitted to again are.
@@ -224,15 +235,20 @@ def _fitted(
 
     def target(v: Points, k: int) -> Vector:
         log_p = admitted(space, v, log_normal(v)) if space.constraints and frame.reduce is None else log_normal(v)
-        return _targets(log_p, *events(rough, v))[k]
+        return _targets(v, log_p, *events(rough, v))[k]
 
     near = Near(start, hits)
-    count = len(_targets(log_normal(hits[:1]), *events(log_probability, hits[:1])))
+    count = len(_aims(*events(log_probability, hits[:1])))
     clouds = tuple(particles(partial(target, k=k), near, _PARTICLES, rng) for k in range(count))
+    kept = [k for k, v in enumerate(clouds) if len(v) and _aims(*events(rough, v))[k].max() > _NOTHING]
+    if not kept:
+        return start, None
+    clouds = tuple(clouds[k] for k in kept)
     mixture = _fitted_to(clouds, start, rng)
     for _ in range(_REFITS):  # from particles that a few ancestors share to points that are independent
         drawn = _drawn(space, frame, mixture, log_probability, _REFIT_POINTS, rng)
-        at, targets = drawn.at, _targets(drawn.at.log_p, drawn.whole, drawn.parts)
+        at, every = drawn.at, _targets(drawn.at.v, drawn.at.log_p, drawn.whole, drawn.parts)
+        targets = [every[k] for k in kept]
         if min(effective_size(target - at.log_h) for target in targets) >= _ENOUGH * _REFIT_POINTS:
             return mixture, drawn
         clouds = tuple(at.v[reweighted(target, at.log_h, _PARTICLES, rng)] for target in targets)
@@ -246,15 +262,21 @@ def _fitted_to(clouds: tuple[Points, ...], start: Mixture, rng: np.random.Genera
     return replace(fitted, most_nominal=start.most_nominal)
 
 
-def _targets(log_p: Vector, whole: Event, parts: tuple[Event, ...]) -> list[Vector]:
-    """Return the log densities that points of a pool should follow, not normalised, where that of the inputs is log_p (n,).
+def _targets(v: Points, log_p: Vector, whole: Event, parts: tuple[Event, ...]) -> list[Vector]:
+    """Return the log densities that points v (n, m) of a pool should follow, not normalised; that of the inputs is log_p (n,)."""
+    log_p = np.where(within_reach(v), log_p, -np.inf)
+    return [log_p + aim for aim in _aims(whole, parts)]
+
+
+def _aims(whole: Event, parts: tuple[Event, ...]) -> list[Vector]:
+    """Return (n,) the logs of what points of a pool should follow beside the density of the inputs.
 
     Those of the event's mass and boundary; where runs failed, between the mass and the boundary of critical or failed ones;
     the mass of each requirement of a combination.
     """
     log_pi, log_not = whole.safe
-    worst = [] if whole.critical is None else [log_p + 0.5 * whole.critical[0]]
-    return [log_p + log_pi, log_p + 0.5 * (log_pi + log_not), *worst, *(log_p + part.safe[0] for part in parts)]
+    worst = [] if whole.critical is None else [0.5 * whole.critical[0]]
+    return [log_pi, 0.5 * (log_pi + log_not), *worst, *(part.safe[0] for part in parts)]
 
 
 def draw_batch(

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.special import gammainccinv, gammaincinv
+from scipy.special import gammaincinv
 from threadpoolctl import threadpool_limits
 
 from sbt.campaigns.counting import DRAWN, NOMINAL
@@ -35,7 +35,7 @@ from sbt.campaigns.stopping import (
 )
 from sbt.estimators.choices import ChoiceScore, choice_scores, from_cube, to_cube
 from sbt.estimators.importance import SHARES
-from sbt.estimators.mixture import wide_scales
+from sbt.estimators.mixture import wide_scales, within_reach
 from sbt.estimators.surrogate import MOST_LEARNED, Coordinates, LogProbability, settled, sketch_of
 from sbt.loop.stages import Batch, Log
 from sbt.problem.arrays import Mask, Points, Vector
@@ -70,8 +70,6 @@ _BATCHES, _BATCH = 8, 15
 the intervals missed where the metric jumps: it was drawn with what a search alone had learned, and no other one denies it."""
 _EXPECTED = 2000
 """Draws of the inputs' distribution by which it is judged what the metamodel expects of it."""
-_BEYOND = 1e-9
-"""Mass of the inputs' distribution beyond the ball in normal scores that is searched: failures out there do not count."""
 _SEARCH_SHARE = (0.2, 0.1)
 """Of later batches, the share that still searches: before and after the count has begun."""
 _SEARCH_BLIND = 0.4
@@ -303,11 +301,10 @@ class SequentialStage:
         s, space, rng = self.settings, self.settings.scenario.space, stream(self.settings.seed, "hunt", log.iteration)
         even = round(_EVEN_SHARE * n)
         spread = rng.random((even, space.dimension))
-        reach = 2.0 * float(gammainccinv(0.5 * space.dimension, _BEYOND))  # squared norm: chi^2
 
         def within(v: Points) -> Mask:
             z = self._scores(v)
-            return space.feasible(space.from_normal(z)) & ((z**2).sum(axis=1) <= reach)
+            return space.feasible(space.from_normal(z)) & within_reach(z)
 
         if n > even:
             search = Search(

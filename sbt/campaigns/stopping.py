@@ -127,7 +127,7 @@ def is_precise(log: Log, settings: Settings, target: float | None) -> bool:
     if target is None or len(counted) < FEWEST_BATCHES:
         return False
     found = combine_estimates(counted)
-    hits = sum(float(b.critical.sum()) for b in counted)
+    hits = sum(b.hits for b in counted)
     half = 0.5 * (found.limit(0.975, side=1) - found.limit(0.975, side=-1))
     between = spread_of_draws(log, counted)
     if between is not None and between.exceeds(target, found.value):  # more warm-ups would narrow it, more runs do not

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sbt.problem.arrays import Vector
+from sbt.problem.arrays import Mask, Vector
 
 __all__ = [
     "BLIND", "SHARES", "Draws", "Plan", "Stated", "at_most_one", "draw_systematic", "plan_batch", "rows_at", "stated",
@@ -162,7 +162,7 @@ def plan_batch(
     """
     n = len(log_w)
     w, pi = np.exp(log_w) / n, np.exp(log_pi)
-    alive = np.isfinite(log_w)
+    alive = w > 0.0
     log_uncertainty = {"difference": 0.5 * (log_pi + log_not), "meta": 0.5 * log_pi}  # standard deviation of the term
     nominal = w / w.sum()
     plans = []
@@ -171,7 +171,7 @@ def plan_batch(
             continue
         r = shares[1] * nominal + shares[2] * alive / alive.sum() + shares[3] * _normalised(log_wide, alive)
         mean = float((w * pi).sum())
-        guided = _guided(log_spread, mean, others, w, log_w)
+        guided = _guided(log_spread, mean, others, w, log_w, alive)
         r += shares[0] * guided
         r /= r.sum()
         variance = stratified_variance(n * w * pi, stratum)
@@ -190,9 +190,10 @@ def stated(event: LogPair, plan: Plan, stratum: Vector) -> Stated:
     return Stated(pi, float((w * pi).sum()), float(one_draw.sum()), stratified_variance(len(w) * w * pi, stratum))
 
 
-def _guided(log_spread: Vector, mean: float, others: Sequence[LogPair], w: Vector, log_w: Vector) -> Vector:
+def _guided(
+    log_spread: Vector, mean: float, others: Sequence[LogPair], w: Vector, log_w: Vector, alive: Mask
+) -> Vector:
     """Return (N,) the probabilities of guided draws, sum 1; `log_spread` and `mean` are those of the first event."""
-    alive = np.isfinite(log_w)
     own = _normalised(log_spread + log_w, alive)
     if not others:
         return own
@@ -211,7 +212,7 @@ def _log(probability: float) -> float:
     return float(np.log(max(probability, _LEAST_PROBABILITY)))
 
 
-def _normalised(log_value: Vector, alive: Vector) -> Vector:
+def _normalised(log_value: Vector, alive: Mask) -> Vector:
     """Return values that sum to 1 over the points that are alive; even there where all vanish."""
     log_value = np.where(alive, log_value, -np.inf)
     top = float(log_value.max())

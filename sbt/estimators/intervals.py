@@ -63,6 +63,16 @@ class CountedBatch:
         return self.prior + float((self.coefficient * (self.critical - self.control_variate)).mean())
 
     @property
+    def hits(self) -> int:
+        """Critical draws; those of weight 0 tell nothing."""
+        return int((self.critical[self.coefficient > 0.0] > 0.0).sum())
+
+    @property
+    def misses(self) -> int:
+        """Draws that were safe; those of weight 0 tell nothing."""
+        return int((self.critical[self.coefficient > 0.0] == 0.0).sum())
+
+    @property
     def errors(self) -> Vector:
         """(n,) what each draw adds to the correction, less their mean, as far as that is known from more than one draw."""
         n, terms = len(self.critical), self.coefficient * (self.critical - self.control_variate)

@@ -18,11 +18,15 @@ from scipy.special import gammainccinv, logsumexp
 
 from sbt.errors import InputError
 from sbt.estimators.choices import ChoiceScore, log_normal, log_wide
-from sbt.problem.arrays import Points, Vector
+from sbt.problem.arrays import Mask, Points, Vector
 
-__all__ = ["Mixture", "Near", "Normals", "effective_size", "fit_mixture", "log_normal", "particles", "reweighted", "wide_scales"]
+__all__ = [
+    "Mixture", "Near", "Normals", "effective_size", "fit_mixture", "log_normal", "particles", "reweighted", "wide_scales",
+    "within_reach",
+]  # fmt: skip
 
 LogTarget = Callable[[Points], Vector]
+_BEYOND = 1e-9  # mass of the distribution beyond the ball in normal scores that is looked at
 _TAIL = 1e-4  # probability of chi^2 beyond the wide component's radius
 _COMPONENTS = (1, 2, 4, 7)  # numbers of normals that are compared: few, as particles are few
 _ROWS = 10  # particles a dimension that each of several normals needs
@@ -49,6 +53,14 @@ def wide_scales(bounded: Vector) -> Vector:
     free = int((bounded == 0).sum())
     s = math.sqrt(2.0 * float(gammainccinv(0.5 * free, _TAIL)) / free) if free else 1.0
     return np.where(bounded == 0, s, 1.0)
+
+
+def within_reach(z: Points) -> Mask:
+    """Return which points z (n, d) lie in the ball beyond which 1e-9 of the standard-normal distribution lies.
+
+    What is critical out there alone does not count: no search looks for it, and no proposal is made for it.
+    """
+    return np.asarray((z**2).sum(axis=1) <= 2.0 * float(gammainccinv(0.5 * z.shape[1], _BEYOND)))
 
 
 @dataclass(frozen=True, eq=False)
