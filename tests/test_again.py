@@ -9,12 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.stats import norm
+from scipy.stats import binomtest, norm
 from typer.testing import CliRunner
 
 import sbt
+from sbt.campaigns.again import Reused
+from sbt.campaigns.asking import answer
 from sbt.cli import app
-from sbt.estimators.reweighting import WeightedShare, defended_bound, few_hits_bound
+from sbt.estimators.reweighting import ReusedBatch, WeightedShare, defended_bound, few_hits_bound
 from sbt.problem.sensitivity import space_parameters
 
 ROOT2 = np.sqrt(2.0)
@@ -59,7 +61,7 @@ def test_few_known_critical_runs_leave_the_bound_of_random_draws(estimated):
     """What the campaign itself says where critical runs are known at fewer than ten inputs."""
     history = estimated.history
     y = np.sort(history.y(history.metrics[0])[history.ok])
-    found = estimated.estimate(critical=(-np.inf, 0.5 * (y[5] + y[6])))
+    found = estimated.estimate(critical=(-np.inf, 0.5 * (y[7] + y[8])))
     assert any("critical runs are known at" in said for said in found.warnings)
     assert 0.02 < found.high < 0.2
 
@@ -129,6 +131,39 @@ def test_draws_from_the_distribution_itself(crude):
     assert row["derivative"] == pytest.approx(norm.sf(1.0), abs=4 * row["std_error"])
     row = shares.loc[("x", "mean")]
     assert row["derivative"] == pytest.approx(0.3 * norm.pdf(1.0), abs=4 * row["std_error"])
+
+
+def test_draws_that_are_all_critical_bound_the_probability_from_below_alone(tmp_path):
+    """Of 300 runs 11 lie in the range that is asked for, where every run is critical: .86 was stated, without a word."""
+    scenario = sbt.Scenario(
+        "late", [sbt.Parameter("a", 0.0, 12.0, "", sbt.Triangular(0.0, 3.0, 10.0))], sbt.Requirement("y", low=7.0),
+        evaluate=lambda values, seed: {"y": values["a"]}, metrics=["y"],
+    )  # fmt: skip
+    result = sbt.run(
+        campaign="estimation", scenario=scenario, acquisition="monte_carlo", budget=300, stop={"cov": None}, seed=5,
+        store=tmp_path / "s", executor="serial", report=False,
+    )  # fmt: skip
+    found = result.estimate({"a": {"min": 8.0, "max": 9.0}})
+    assert (found.probability, found.high) == (1.0, 1.0)
+    assert 0.0 < found.low < 0.95
+    assert "no counted draw was safe: only a lower bound is given" in found.warnings
+    for asked in ({"max": 9.0}, {"min": 2.0}):  # others are safe, too
+        assert not any("lower bound" in text for text in result.estimate({"a": asked}).warnings)
+    with pytest.raises(sbt.InputError, match=r"within \[0, 10\], but is to be 10\.\d+ to 12, where there were no draws"):
+        result.estimate({"a": sbt.Uniform()})
+
+
+def test_failed_draws_are_safe_below_where_all_others_are_critical():
+    """15 of 20 draws were critical, the others failed: at least .83 was stated for what may be .75."""
+    inputs = [sbt.Parameter("a", 0.0, 1.0)]
+    space = sbt.Scenario("s", inputs, sbt.Requirement("y", low=0.0), evaluate=lambda v, s: {"y": 0.0}).space
+    x, critical = np.full((20, 1), 0.5), np.repeat([1.0, 0.0], [15, 5])
+    safe, worst = (ReusedBatch(x, np.ones(20), np.zeros(20), hits) for hits in (critical, np.ones(20)))
+    for crude in (False, True):
+        found = answer(Reused(space, (safe,), (worst,), 5, np.ones(20), np.ones(9), crude, 15, 0, np.full(20, -1), 3.0, known=15))
+        assert found.probability == 0.75
+        assert binomtest(15, 20).proportion_ci().low == pytest.approx(found.low, rel=0.02)
+        assert found.high == 1.0
 
 
 def test_what_the_runs_cannot_tell_is_refused(estimated, crude, tmp_path):

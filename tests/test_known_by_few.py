@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 import sbt
+from sbt.campaigns.gate import Limits
+from sbt.campaigns.unviolated import Unviolated
 from sbt.testbeds import analytic
 
 INPUTS = {"a": (0.0, 1.0), "b": (0.0, 1.0), "c": (0.0, 1.0)}
@@ -98,6 +100,39 @@ def test_of_several_requirements_each_is_known_by_its_own_runs(tmp_path: Path):
     assert any(f"critical runs of a requirement are known at {known} input" in text for text in found.warnings)
     assert found.low <= 0.053 <= found.high
     assert found.requirements[1].low <= math.pi * 0.12**2 <= found.requirements[1].high
+
+
+def test_a_requirement_that_no_run_violated_may_hold_what_its_draws_leave(tmp_path: Path):
+    """The whole ended at .0063 where a part of it that no run had met ended at .12; draws lay 3,000 deviations out for it."""
+
+    def evaluate(values: dict, _: int) -> dict:
+        return {"ttc": 3.0 - values["a"] - 0.3 * values["b"], "impact": 0.0, "gap": 30.0 + values["b"]}
+
+    need = sbt.any_of(sbt.Requirement("ttc", high=0.0), sbt.Requirement("impact", low=5.0), sbt.Requirement("gap", high=1.0))
+    inputs = [sbt.Parameter(name, -8.0, 8.0, "", sbt.Normal(0.0, 1.0)) for name in "ab"]
+    result = sbt.run(
+        campaign="estimation", scenario=sbt.Scenario("three", inputs, need, evaluate=evaluate, metrics=["ttc", "impact", "gap"]),
+        budget=80, seed=1, executor="serial", store=tmp_path / "s", report=False, stop={"cov": None},
+    )  # fmt: skip
+    for found in (result.conclusion, result.estimate({"a": sbt.Normal(0.1, 1.0)})):
+        assert found.high > 10.0 * found.probability > 0.0
+        assert any(text.startswith("no run violated impact, whose metric had one value in all runs") for text in found.warnings)
+        assert any(text.startswith("no run violated gap: the interval has of it what its") for text in found.warnings)
+    whole, parts = result.conclusion, result.conclusion.requirements
+    assert whole.high >= parts[1].high
+    counted = result.frame[result.frame.stage == "estimation"]
+    assert np.isfinite(counted.log_q).all()
+
+
+def test_parts_that_a_metamodel_tells_of_leave_an_interval_as_it_is():
+    def limits(upper: float) -> Limits:
+        return Limits(lambda _: 0.0, lambda _: upper)
+
+    told, untold = Unviolated(("far",)), Unviolated(("far", "flag"), ("flag",))
+    assert told.reached(limits(0.02), lambda _: 0.1, lambda _: 0.3).upper(0.95) == 0.02
+    assert untold.reached(limits(0.02), lambda _: 0.1, lambda _: 0.3).upper(0.95) == pytest.approx(0.12)
+    assert untold.reached(limits(0.25), lambda _: 0.1, lambda _: 0.3).upper(0.95) == 0.3
+    assert untold.reached(limits(0.4), lambda _: 0.1, lambda _: 0.3).upper(0.95) == 0.4
 
 
 def test_a_metric_of_one_value_is_known_as_soon_as_runs_that_fill_the_space_bound_the_rest(tmp_path: Path):

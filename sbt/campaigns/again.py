@@ -7,7 +7,7 @@ A metamodel that knows only the runs before a batch is the control variate of it
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,16 +20,17 @@ from sbt.campaigns.pools import Frame, admitted, most_nominal, sample_mixture
 from sbt.campaigns.records import EstimationProposal
 from sbt.campaigns.settings import Settings
 from sbt.campaigns.summing import counted_with, took_sum
+from sbt.campaigns.unviolated import Unviolated
 from sbt.errors import InputError
 from sbt.estimators.choices import choice_scores, log_normal
 from sbt.estimators.events import events
-from sbt.estimators.mixture import Mixture, Near, fit_mixture, particles, wide_scales
+from sbt.estimators.mixture import Mixture, Near, fit_mixture, particles, wide_scales, within_reach
 from sbt.estimators.reweighting import Predicted, ReusedBatch, effective_size
 from sbt.estimators.surrogate import Coordinates, LogProbability
 from sbt.loop.stages import Log
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.cells import MOST_GIVEN, MOST_JOINED
-from sbt.problem.sensitivity import outside
+from sbt.problem.sensitivity import drawn_between, outside
 from sbt.problem.space import ParameterSpace
 from sbt.seeds import stream
 from sbt.store.history import History
@@ -70,6 +71,7 @@ class Reused:
         taught: further draws from the campaign's distribution, which taught and do not count.
         met: of all draws from the campaign's distribution, those that were critical or failed.
         known: different inputs of critical runs.
+        unviolated: requirements that no run violated.
     """
 
     space: ParameterSpace
@@ -86,6 +88,7 @@ class Reused:
     taught: int = 0
     met: int = 0
     known: int = 0
+    unviolated: Unviolated = field(default_factory=Unviolated)
 
     @property
     def unmet(self) -> Vector:
@@ -134,6 +137,7 @@ def reused(log: Log, settings: Settings, space: ParameterSpace) -> Reused:
         int((hits & reached).sum()), int((history.ok & ~hits & reached).sum()),
         history.columns["warm_up"][every], least,
         seen.draws - round(float(nominal.sum())) if not plainly else 0, seen.hits + seen.failed, seen.known,
+        Unviolated.of(history, settings),
     )  # fmt: skip
 
 
@@ -210,8 +214,9 @@ def _check(log: Log, settings: Settings, space: ParameterSpace) -> None:
     for old, new in zip(settings.scenario.space.parameters, space.parameters, strict=True):
         x = outside(old, new)
         if len(x):
-            rule = f"input {new.name} must stay where the campaign drew it, in {old.range}"
-            raise InputError(f"{rule}, but is to reach {x.min():.6g} to {x.max():.6g}: run a campaign there")
+            rule = f"input {new.name} must stay where the campaign drew it, within {drawn_between(old)}"
+            reach = f"but is to be {x.min():.6g} to {x.max():.6g}, where there were no draws"
+            raise InputError(f"{rule}, {reach}: run a campaign there")
 
 
 def _check_joined(old: ParameterSpace, space: ParameterSpace) -> None:
@@ -263,7 +268,8 @@ def _mixture(
         return blank
 
     def log_p(z: Points) -> Vector:
-        return admitted(space, z, log_normal(z)) if space.constraints else log_normal(z)
+        density = admitted(space, z, log_normal(z)) if space.constraints else log_normal(z)
+        return np.where(within_reach(z), density, -np.inf)
 
     def mass(z: Points) -> Vector:
         return log_p(z) + learned(old.to_normal(space.from_normal(z)))[0]

@@ -22,6 +22,7 @@ __all__ = ["Sensitivity", "answer", "sensitivities"]
 _CONFIDENCE = 0.95
 _HEAVY = 0.25
 """Share of the weight that one draw may carry before the reader is warned."""
+_NONE_SAFE = "no counted draw was safe: only a lower bound is given"
 
 
 @dataclass(frozen=True)
@@ -70,14 +71,14 @@ def _from_batches(found: Reused) -> Concluded:
     """Return what batches with a control variate say."""
     safe, worst = [_weighted(b) for b in found.batches], [_weighted(b) for b in found.worst]
     low, high = combine_estimates(safe), combine_estimates(worst)
-    hits, perhaps = (int(sum((b.critical[b.coefficient > 0] > 0).sum() for b in batches)) for batches in (safe, worst))
-    misses = int(sum((b.coefficient > 0).sum() for b in safe)) - perhaps
+    hits, perhaps, misses = sum(b.hits for b in safe), sum(b.hits for b in worst), sum(b.misses for b in worst)
+    not_hits = sum(b.misses for b in safe)
     missed = defended_bound(0, found.unmet, found.ratio, _CONFIDENCE)
 
     def bound(count: int, confidence: float) -> float:
         return defended_bound(count, found.nominal, found.ratio, confidence)
 
-    few_low, few_high = min(hits, misses + perhaps - hits) < FEW_HITS, min(perhaps, misses) < FEW_HITS
+    few_low, few_high = min(hits, not_hits) < FEW_HITS, min(perhaps, misses) < FEW_HITS
     value, exact, warnings = min(max(low.value, 0.0), 1.0), None, []
     limits = Limits(lambda c: low.limit(c, side=-1, few=few_low), lambda c: high.limit(c, side=1, few=few_high))
     if not found.critical:
@@ -85,35 +86,49 @@ def _from_batches(found: Reused) -> Concluded:
         exact = limits.upper(_CONFIDENCE)
         warnings.append("nothing critical was met: the probability is only bounded from above")
     elif not found.safe or misses == 0:
-        value = value if found.safe else 1.0
-        limits = Limits(lambda c: 1.0 - bound(misses, c), lambda _: 1.0)
-        warnings.append("no counted draw was safe: only a lower bound is given")
+        value = value if found.safe or not_hits else 1.0
+        limits = Limits(lambda c: 1.0 - bound(not_hits, c), lambda _: 1.0)
+        warnings.append(_NONE_SAFE)
     elif hits == 0:
         limits = Limits(lambda _: 0.0, lambda c: max(high.limit(c, side=1), bound(perhaps, c)))
         warnings.append("no counted draw was critical: only an upper bound is given")
     elif found.known < FEW_KNOWN:
         limits = limits.reaching(lambda c: defended_bound(found.met, found.unmet, found.ratio, c))
-        draws = f"the upper end is at least that of {round(float(found.unmet.sum()))} draws from the campaign's distribution"
+        draws = f"the upper end is at least that of {_draws_words(found)}"
         warnings.append(f"critical runs are known at {plural(found.known, 'input')}, fewer than {FEW_KNOWN}: {draws}")
     elif few_low or few_high:
         met = f"{plural(hits, 'counted draw')} critical" if hits < FEW_HITS else f"{plural(misses, 'counted draw')} safe"
         warnings.append(f"only {met}, fewer than {FEW_HITS}: the interval is that of so small a number")
+    if found.critical:
+        def alone(c: float) -> float:
+            return defended_bound(found.failed, found.unmet, found.ratio, c)
+
+        limits = found.unviolated.reached(limits, alone, lambda c: defended_bound(found.met, found.unmet, found.ratio, c))
+        warnings += found.unviolated.sentences(_draws_words(found), alone(0.5 * (1.0 + _CONFIDENCE)))
     return _conclusion(value, limits, low.std_error, max(min(max(high.value, 0.0), 1.0), value), hits, missed, exact, warnings)
+
+
+def _draws_words(found: Reused) -> str:
+    return f"{plural(round(float(found.unmet.sum())), 'draw')} from the campaign's distribution"
 
 
 def _from_nominal(found: Reused) -> Concluded:
     """Return what draws from the campaign's distribution itself say."""
     batch, worst = found.batches[0], found.worst[0]
     low, high = (WeightedShare(b.coefficient, b.critical) for b in (batch, worst))
-    hits = int((batch.critical[batch.coefficient > 0] > 0).sum())
+    hits, misses, not_hits = _weighted(batch).hits, _weighted(worst).misses, _weighted(batch).misses
     missed = defended_bound(0, found.unmet, found.ratio, _CONFIDENCE)
-    exact, warnings = None, []
+    value, exact, warnings = min(low.value, 1.0), None, []
     limits = Limits(low.lower, high.upper)
     if not hits:
         limits = Limits(low.lower, lambda c: defended_bound(int(worst.critical.sum()), found.nominal, found.ratio, c))
         exact = limits.upper(_CONFIDENCE)
         warnings.append("nothing critical was met: the probability is only bounded from above")
-    return _conclusion(min(low.value, 1.0), limits, low.std_error, min(high.value, 1.0), hits, missed, exact, warnings)
+    elif not misses:
+        value = value if not_hits else 1.0
+        limits = Limits(lambda c: 1.0 - defended_bound(not_hits, found.nominal, found.ratio, c), lambda _: 1.0)
+        warnings.append(_NONE_SAFE)
+    return _conclusion(value, limits, low.std_error, min(high.value, 1.0), hits, missed, exact, warnings)
 
 
 def _conclusion(

@@ -37,6 +37,7 @@ from sbt.campaigns.stopping import not_met
 from sbt.campaigns.summing import SummingStage, summed, sums, took_sum
 from sbt.campaigns.telling import tell_estimation
 from sbt.campaigns.two_level import TwoLevelStage
+from sbt.campaigns.unviolated import Unviolated
 from sbt.campaigns.warmed import warmed_traffic
 from sbt.campaigns.wording import number, plural
 from sbt.errors import InputError
@@ -234,12 +235,13 @@ def _from_batches(log: Log, settings: Settings, seen: Seen | None = None) -> Con
     if not safe:
         return _uncounted(log, seen)
     low, high = combine_estimates(safe), combine_estimates(critical)
-    counted, hits, worst = sum(len(b.critical) for b in safe), _hits(safe), _hits(critical)
-    misses = counted - worst
-    few_low, few_high = min(hits, counted - hits) < FEW_HITS, min(worst, misses) < FEW_HITS  # the same where no run failed
+    hits, worst, misses = sum(b.hits for b in safe), sum(b.hits for b in critical), sum(b.misses for b in critical)
+    safest = sum(b.misses for b in safe)  # that of `misses` where no run failed, as each of these two
+    few_low, few_high = min(hits, safest) < FEW_HITS, min(worst, misses) < FEW_HITS
     value, exact_bound = _clipped(low.value), None
     limits = Limits(lambda c: low.limit(c, side=-1, few=few_low), lambda c: high.limit(c, side=1, few=few_high))
-    failing = not log.history.ok.all()
+    failing, draws = not log.history.ok.all(), f"{plural(seen.draws, 'draw')} from the inputs' distribution"
+    at_least = f"the upper end is at least that of {draws}"
     if hits and misses:
         unstated = failing and any(map(is_two_level, log.iterations))
         limits = held(limits, seen, low.value, high.value, unstated=unstated)
@@ -251,9 +253,8 @@ def _from_batches(log: Log, settings: Settings, seen: Seen | None = None) -> Con
     elif not seen.safe:
         value = 1.0 if log.history.ok.all() else value
         limits = Limits(lambda c: 1.0 - seen.most(seen.failed, c), lambda _: 1.0)
-        warnings.append(
-            "everything was critical: the probability is only bounded from below, by the draws from the inputs' distribution"
-        )
+        bounded = "the probability is only bounded from below, by the draws from the inputs' distribution"
+        warnings.append(f"everything was critical: {bounded}")
     elif hits == 0:
         missed = seen.most_critical if few_high else limits.upper
         limits = Limits(lambda _: 0.0, lambda c: max(high.limit(c, side=1), missed(c)))
@@ -264,25 +265,25 @@ def _from_batches(log: Log, settings: Settings, seen: Seen | None = None) -> Con
         warnings.append("no counted draw was safe: only a lower bound is given")
     elif seen.known < FEW_KNOWN:
         limits = limits.reaching(seen.most_critical)
-        draws = f"the upper end is at least that of {plural(seen.draws, 'draw')} from the inputs' distribution"
         need = settings.scenario.requirement
         whose = " of a requirement" if isinstance(need, CombinedRequirement) and need.how == "any" else ""
-        warnings.append(f"critical runs{whose} are known at {plural(seen.known, 'input')}, fewer than {FEW_KNOWN}: {draws}")
+        warnings.append(f"critical runs{whose} are known at {plural(seen.known, 'input')}, fewer than {FEW_KNOWN}: {at_least}")
     elif min(hits, misses) < FEW_HITS:
         few, what = (hits, "critical") if hits < FEW_HITS else (misses, "safe")
         met = f"{few} counted draw{' was' if few == 1 else 's were'} {what}"
-        draws = f"{plural(seen.draws, 'draw')} from the inputs' distribution"
         warnings.append(f"only {met}, fewer than {FEW_HITS}: so small a number, or {draws}, set the interval")
     late = hits > 0 and misses > 0 and seen.surprised > counted_iterations(log)[-1]
     if late:
         limits = limits.reaching(seen.most_critical)
-        said = "a draw after the last one that counts was critical where the metamodel denied it"
-        draws = f"the upper end is at least that of {plural(seen.draws, 'draw')} from the inputs' distribution"
-        warnings.append(f"{said}: {draws}")
+        warnings.append(f"a draw after the last one that counts was critical where the metamodel denied it: {at_least}")
     highest = max(_clipped(high.value), value)
     if not late and (few_low or few_high or hardly_known(value, low.std_error) or hardly_known(highest, high.std_error)):
         limits = limits.within(seen.limits, value, highest)
         warnings += denied_by_draws(seen, value, highest, 0.5 * (1.0 + _CONFIDENCE))
+    if seen.critical:
+        others = Unviolated.of(log.history, settings)
+        limits = others.reached(limits, lambda c: seen.most(seen.failed, c), seen.most_critical)
+        warnings += others.sentences(draws, seen.most(seen.failed, 0.5 * (1.0 + _CONFIDENCE)))
     warnings += cautions(len(safe), low.largest_term, value, seen.surprises)
     return _conclusion(
         log, value, limits, failed=worst - hits + _failed_beside(log, settings, seen, limits), hits=hits, failed_as_safe=value,
@@ -291,7 +292,7 @@ def _from_batches(log: Log, settings: Settings, seen: Seen | None = None) -> Con
         undetected_mass_bound=seen.most(seen.surprises, _CONFIDENCE), warnings=tuple(warnings),
         largest_weight_share=low.largest_share,
         convergence=_convergence(log, safe, critical) if seen.critical and seen.safe else None,
-        counted=counted, exact_bound=exact_bound,
+        counted=sum(len(b.critical) for b in safe), exact_bound=exact_bound,
     ), limits  # fmt: skip
 
 
@@ -386,10 +387,6 @@ def _from_repeats(log: Log, settings: Settings) -> Concluded:
 
 def _clipped(value: float) -> float:
     return min(max(value, 0.0), 1.0)
-
-
-def _hits(batches: list[CountedBatch]) -> int:
-    return int(sum(b.critical.sum() for b in batches))
 
 
 ESTIMATION = CampaignKind(

@@ -31,6 +31,8 @@ _COVERED = 0.02
 """By which the mean of a density ratio may miss 1 under the density below: beyond, the one above has mass elsewhere."""
 _SCORES = np.linspace(-6.0, 6.0, 4001)
 """Normal scores of an input where another distribution must have mass: 2e-9 lies beyond."""
+_FARTHEST, _DIGITS = 30.0, 6
+"""A normal score at which a distribution is at its end, and digits of the values between its ends."""
 _NODES, _TOLD = np.linspace(-8.0, 8.0, 641), 5.0
 """Normal scores over which scores are summed, and up to which the sums must be how the distribution function moves ..."""
 _EXPLAINED, _NOTHING = 0.03, 1e-3
@@ -144,6 +146,15 @@ def outside(old: Parameter, new: Parameter) -> Vector:
     """Return values that an input takes with a new distribution (or new probabilities) and never with the old one."""
     x = np.arange(len(new.choices), dtype=np.float64) if new.choices else new.from_normal(_SCORES)
     return np.asarray(x[~(old.log_density(x) > -np.inf)])
+
+
+def drawn_between(parameter: Parameter) -> str:
+    """Return the values between which an input is drawn, as printed: a distribution may end within the range."""
+    if parameter.choices:
+        return parameter.range
+    low, high = parameter.from_normal(np.array([-_FARTHEST, _FARTHEST])).tolist()
+    digits = _DIGITS - math.floor(math.log10(high - low)) if high > low else _DIGITS
+    return f"[{round(low, digits):g}, {round(high, digits):g}] {parameter.unit}".rstrip()
 
 
 def space_parameters(space: ParameterSpace) -> Iterator[SpaceParameter]:
