@@ -47,6 +47,8 @@ def test_no_number_of_runs_is_advised_where_failed_runs_decide_the_width():
     lost = "failed runs decide"
     assert "narrow enough" in _next()
     assert "more runs (budget" in _next(cov=0.2)
+    for learned in (None, ()):  # a sum, or random draws; draws that a metamodel chose
+        assert ("where a metamodel goes on to learn" in _next(cov=0.2, convergence=learned)) is (learned is not None)
     for cov in (0.05, 0.2):
         assert lost in _next(cov=cov, high=0.5, failed_as_critical=0.3)
         assert lost not in _next(cov=cov, failed_as_critical=0.11)

@@ -39,7 +39,9 @@ def more_runs(found: EstimationConclusion, n: int) -> str:
         more = f"about {rounded(total - n):,} more runs (budget: {total:,})"
         return f"{more}, which repeat combinations, give it to \N{PLUS-MINUS SIGN}20 % (95 %)"
     counted, known, narrow = found.counted or n, bool(found.probability), bool(found.probability) and width(found) <= 1.0
-    return _runs_for_precision(counted * (too_wide(found) ** 2 - 1.0), n or counted, known=known, narrow=narrow)
+    learns = found.convergence is not None  # told of draws that a metamodel chose
+    lacking = counted * (too_wide(found) ** 2 - 1.0)
+    return _runs_for_precision(lacking, n or counted, known=known, narrow=narrow, learns=learns)
 
 
 def as_many_draws(found: EstimationConclusion, n: int) -> str:
@@ -57,7 +59,7 @@ def as_many_draws(found: EstimationConclusion, n: int) -> str:
     return "; as many draws from the inputs' distribution would bound it better (acquisition: {kind: monte_carlo})"
 
 
-def _runs_for_precision(more: float, made: int, *, known: bool, narrow: bool = False) -> str:
+def _runs_for_precision(more: float, made: int, *, known: bool, narrow: bool, learns: bool) -> str:
     """Return how many more runs, beside those that were made, give the estimate its precision.
 
     Args:
@@ -65,16 +67,15 @@ def _runs_for_precision(more: float, made: int, *, known: bool, narrow: bool = F
         made: so many.
         known: the estimate is not 0.
         narrow: its interval is as narrow as asked; only few critical draws count.
+        learns: a metamodel chose them.
     """
     if not known or more > _FAR * made:
         return f"a larger budget: ten times {made:,} runs tell how many it takes, since too few critical draws count now"
     if narrow:
         budget = f"about {rounded(more):,} more runs (budget: {rounded(made + more):,})"
         return f"{budget}, until {FEWEST_HITS} critical draws count: its interval is narrow, but of fewer"
-    return (
-        f"about {rounded(more):,} more runs (budget: {rounded(made + more):,}) give it to \N{PLUS-MINUS SIGN}20 % (95 %),"
-        " fewer where a metamodel goes on to learn"
-    )
+    said = f"about {rounded(more):,} more runs (budget: {rounded(made + more):,}) give it to \N{PLUS-MINUS SIGN}20 % (95 %)"
+    return f"{said}, fewer where a metamodel goes on to learn" if learns else said
 
 
 def too_wide(found: EstimationConclusion) -> float:

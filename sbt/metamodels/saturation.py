@@ -89,7 +89,7 @@ def opened_and_limit(u: Points, y: Vector, critical: CriticalInterval, rng: np.r
         return moved, _limit(u, y, moved, critical)
     margin = critical.margin(y)
     tied = margin == 0.0
-    if is_flag(y, critical):
+    if is_flag(y, critical) and min(np.unique(y, return_counts=True)[1]) >= _FEWEST:  # one alone may be a speed of impact
         return centred(u, y, critical), None
     if tied.sum() < _FEWEST or (margin < 0.0).any():
         y = centred(u, y, critical)
