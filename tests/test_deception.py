@@ -15,7 +15,8 @@ from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.problem.requirement import CriticalInterval
 from sbt.samplers import portfolio
 from sbt.samplers.regions import niches, regions
-from sbt.samplers.search import Search, search_data, spread_out
+from sbt.samplers.room import spread_out
+from sbt.samplers.search import Search, search_data
 from sbt.seeds import stream
 from sbt.testbeds import values
 

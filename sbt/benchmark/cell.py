@@ -100,8 +100,8 @@ def run_cell(cell: Cell, progress: Callable[[Progress], None] | None = None) -> 
         limit = None if config.executor.timeout == float("inf") else config.executor.timeout
         with _Recalling(SerialExecutor(parts.spec, limit), _known_runs(cell)) as executor:
             finished = run_stages(
-                Campaign((stage,), conclude, recorded=scenario.pool), store, executor, seed=config.seed, budget=config.budget,
-                requirement=scenario.requirement, versions="", listener=progress or (lambda _: None),
+                Campaign((stage,), conclude, recorded=scenario.pool, space=scenario.space), store, executor, seed=config.seed,
+                budget=config.budget, requirement=scenario.requirement, versions="", listener=progress or (lambda _: None),
             )  # fmt: skip
         history = store.history()
         critical = scenario.requirement.critical_runs(history)

@@ -88,8 +88,9 @@ def make_reference(loaded: Loaded, workers: int, progress: Callable[[Progress], 
         executor: Executor = SerialExecutor(parts.spec, limit) if workers == 1 else LocalExecutor(parts.spec, workers, limit)
         with executor:
             run_stages(
-                Campaign((stage,), lambda log: (PlainConclusion({}), None)), store, executor, seed=config.seed,
-                budget=config.budget, requirement=parts.scenario.requirement, versions="", listener=progress or (lambda _: None),
+                Campaign((stage,), lambda log: (PlainConclusion({}), None), space=parts.scenario.space), store, executor,
+                seed=config.seed, budget=config.budget, requirement=parts.scenario.requirement, versions="",
+                listener=progress or (lambda _: None),
             )  # fmt: skip
     return folder
 

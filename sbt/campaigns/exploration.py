@@ -177,4 +177,4 @@ def explore(settings: Settings, log: Log, n: int) -> Points:
         search, u, y, n, stream(settings.seed, "hunt", log.iteration), seen.iteration, filling, pending=pending,
         around_floors=hidden,
     )  # fmt: skip
-    return space.from_unit(np.clip(picks.u, 1e-12, 1 - 1e-12))
+    return space.from_unit(picks.u)

@@ -32,7 +32,8 @@ from sbt.samplers.criteria import CRITERIA, propose_by
 from sbt.samplers.greedy import influence_on_mean, propose_greedily
 from sbt.samplers.pairs import propose_pairs
 from sbt.samplers.roi import rejection
-from sbt.samplers.search import Picks, fill_uniformly
+from sbt.samplers.room import fill_uniformly
+from sbt.samplers.search import Picks
 from sbt.samplers.sobol import SobolSequence
 from sbt.seeds import stream
 from sbt.store.database import PlannedRun
@@ -160,9 +161,12 @@ class SearchStage:
         """Return up to n critical runs (k, d) of an earlier campaign of another setup, each far from those before it."""
         s = self.failure_search.settings
         space = s.scenario.space
-        if s.transfer is None or n == 0 or not len(s.transfer.hits):
+        if s.transfer is None or n == 0:
             return np.empty((0, space.dimension))
         u = np.clip(space.to_unit(space.from_normal(s.transfer.hits)), 0.0, 1.0)
+        u = u[self.failure_search.search.feasible(u)]  # rounding may cross the edge of a constraint
+        if not len(u):
+            return u
         chosen, distance = [0], cdist(u, u[:1])[:, 0]
         while len(chosen) < n and distance.max() > 0.0:
             chosen.append(int(distance.argmax()))
@@ -219,7 +223,8 @@ class SearchStage:
         generations = [
             margin[(runs.iteration == k) & (runs.stage == _SEARCH)] for k in np.unique(runs.iteration[runs.stage == _SEARCH])
         ]
-        return evolution.propose(u[int(np.argmin(begin))], generations, n, s.seed, s.scenario.space.cube)
+        feasible = self.failure_search.search.feasible
+        return evolution.propose(u[int(np.argmin(begin))], generations, n, s.seed, s.scenario.space.cube, feasible)
 
     def _scored(self, log: Log, n: int) -> Picks:
         """Return n points by an acquisition function: drawn in proportion to exp(score), or greedily."""

@@ -15,7 +15,7 @@ from sbt.loop.stages import Log
 from sbt.problem.arrays import Points
 from sbt.problem.covariates import Covariates
 from sbt.samplers.pairs import propose_pairs
-from sbt.samplers.search import fill_uniformly
+from sbt.samplers.room import fill_uniformly
 from sbt.seeds import SEED_END, stream
 from sbt.store.history import VALIDATION
 from sbt.store.planning import PlannedRun

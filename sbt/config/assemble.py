@@ -162,7 +162,10 @@ def _scenario(loaded: Loaded, problems: Problems) -> LogicalScenario:
     requirement = _requirement(loaded, scenario, problems)
     if (choice := config.fidelity) is not None:
         problems.attempt(("fidelity",), partial(check_levels, choice, spec, replace(scenario, requirement=requirement)))
-    return replace(scenario, space=space, requirement=requirement)
+    pool = scenario.pool
+    if pool is not None and space is not scenario.space:
+        pool = problems.attempt(("scenario",), partial(pool.within, scenario.space, space)) or pool
+    return replace(scenario, space=space, requirement=requirement, pool=pool)
 
 
 def _requirement(loaded: Loaded, scenario: LogicalScenario, problems: Problems) -> Requirement:

@@ -25,7 +25,6 @@ from sbt.loop.learner import FittedMetamodel
 from sbt.loop.stages import BACK, Batch, Campaign, Conclusion, Facts, Log, LooksAhead, Progress, Shard, Stage, proposed
 from sbt.problem.outcome import Job
 from sbt.problem.plain import Json
-from sbt.problem.pool import Pool
 from sbt.problem.requirement import Requirement
 from sbt.seeds import run_seeds
 from sbt.store.database import Store
@@ -85,7 +84,7 @@ def run_stages(
     driver.counter.count_all(store.history())
     while k < len(campaign.stages):
         later = {stage.name for stage in campaign.stages[k + 1 :]} - {stage.name for stage in campaign.stages[: k + 1]}
-        loop = _StageLoop(campaign.stages[k], driver, executor, frozenset(later), campaign.recorded)
+        loop = _StageLoop(campaign.stages[k], driver, executor, frozenset(later), campaign)
         reason = loop.run(sent_back=reason == BACK)
         k = 0 if reason == BACK else k + 1
     log = _log(store, 0)
@@ -128,14 +127,14 @@ class _StageLoop:
         driver: writes them.
         executor: runs them; where that leaves this process idle, a stage that looks ahead chooses meanwhile.
         later: stages after it, whose batches it waits for.
-        recorded: the rows that runs are; None: they are run.
+        campaign: of the stage.
     """
 
     stage: Stage
     driver: Driver
     executor: Executor
     later: frozenset[str]
-    recorded: Pool | None = None
+    campaign: Campaign
     _queue: deque[Job] = field(default_factory=deque)
     _planned: deque[Iterator[Job]] = field(default_factory=deque)
     _thought: _Thought | None = None
@@ -188,7 +187,7 @@ class _StageLoop:
                 if unfinished is None:
                     counter.tell(f"{self.stage.name}: choosing")
                 apart = ahead > 0 and is_apart(self.executor)
-                self._thought = _Thought(self.stage, _log(store, ahead, self.later), self.recorded, apart=apart)
+                self._thought = _Thought(self.stage, _log(store, ahead, self.later), self.campaign, apart=apart)
             if not self._thought.ended:
                 return
             thought, self._thought = self._thought, None
@@ -208,9 +207,9 @@ class _StageLoop:
 class _Thought:
     """Whether a stage is over, or its next batch; here and now, or beside what else this process does."""
 
-    def __init__(self, stage: Stage, log: Log, recorded: Pool | None, *, apart: bool):
+    def __init__(self, stage: Stage, log: Log, campaign: Campaign, *, apart: bool):
         self.log, self.seconds = log, 0.0
-        self._stage, self._recorded = stage, recorded
+        self._stage, self._campaign = stage, campaign
         self._found: str | Batch | None = None
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._think, name="sbt-thinker", daemon=True) if apart else None
@@ -223,7 +222,7 @@ class _Thought:
         start = time.perf_counter()
         try:
             stopped = self._stage.stop(self.log)
-            self._found = stopped if stopped is not None else proposed(self._stage, self.log, self._recorded)
+            self._found = stopped if stopped is not None else proposed(self._stage, self.log, self._campaign)
         except BaseException as error:  # raised again where it is waited for
             self._error = error
         self.seconds = time.perf_counter() - start
@@ -298,7 +297,7 @@ def _ahead(campaign: Campaign, rows: Rows) -> list[tuple[str, Batch]]:
     batches: list[tuple[str, Batch]] = []
     for stage in campaign.stages:
         while stage.stop(log := Log(rows.history(), tuple(iterations), ())) is None:
-            batch = proposed(stage, log, campaign.recorded)
+            batch = proposed(stage, log, campaign)
             x = as_numbers([[run.inputs[name] for name in rows.names] for run in batch.runs], rows.names, rows.choices)
             n = len(batch.runs)
             columns = {

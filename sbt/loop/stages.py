@@ -7,14 +7,17 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Protocol, TypeVar, runtime_checkable
 
+import numpy as np
+
 from sbt.errors import InputError
 from sbt.loop.learner import FittedMetamodel
 from sbt.problem.outcome import Doubt
-from sbt.problem.plain import Json, unit_of
+from sbt.problem.plain import Json, unit_of, written
 from sbt.problem.pool import Pool
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
-from sbt.store.database import PlannedRun
+from sbt.problem.space import ParameterSpace
+from sbt.store.database import PlannedPoints, PlannedRun
 from sbt.store.history import History, as_numbers
 from sbt.store.records import FitRecord, Iteration
 
@@ -196,15 +199,17 @@ class LooksAhead(Stage, Protocol):
         ...
 
 
-def proposed(stage: Stage, log: Log, recorded: Pool | None = None) -> Batch:
-    """Return the stage's next batch; of `recorded` inputs with several rows, the seed says which of them.
+def proposed(stage: Stage, log: Log, campaign: Campaign) -> Batch:
+    """Return the next batch of a stage of a campaign; of recorded inputs with several rows, the seed says which of them.
 
     Raises:
-        InputError: it has no runs.
+        InputError: it has no runs, or some that break the constraints.
     """
-    batch = stage.propose(log)
+    batch, space, recorded = stage.propose(log), campaign.space, campaign.recorded
     if not batch.runs:
         raise InputError(f"stage {stage.name} must propose runs or stop, but it did neither")
+    if space is not None and space.constraints:
+        _check_constraints(stage.name, batch.runs, space)
     if recorded is None or not recorded.repeats:
         return batch
     known = log.planned
@@ -212,6 +217,16 @@ def proposed(stage: Stage, log: Log, recorded: Pool | None = None) -> Batch:
     numbers = recorded.numbers(known.x, x)
     runs = [r if k is None else replace(r, seed=k, blind=True) for r, k in zip(batch.runs, numbers, strict=True)]
     return replace(batch, runs=runs)
+
+
+def _check_constraints(stage: str, runs: Sequence[PlannedRun], space: ParameterSpace) -> None:
+    """Refuse runs of a stage that break the constraints."""
+    rows = [[run.inputs[name] for name in space.names] for run in runs] if not isinstance(runs, PlannedPoints) else []
+    x = runs.x if isinstance(runs, PlannedPoints) else as_numbers(rows, space.names, space.choices)
+    broken = np.flatnonzero(~space.satisfied(x))
+    if len(broken):
+        got = written(space.named(x[broken[0]]))
+        raise InputError(f"stage {stage} must propose runs that satisfy '{space.rules}', but proposed {got}")
 
 
 @dataclass(frozen=True)
@@ -224,12 +239,14 @@ class Campaign:
         depends: how batches, or when they end, depend on results; None: not at all, so that all runs
             can be planned ahead and shared out.
         recorded: the rows that runs are; None: they are run.
+        space: whose constraints every run satisfies; None: there are none.
     """
 
     stages: tuple[Stage, ...]
     conclude: Callable[[Log], tuple[Conclusion, FittedMetamodel | None]]
     depends: str | None = "each batch depends on all results before it"
     recorded: Pool | None = None
+    space: ParameterSpace | None = None
 
 
 @dataclass(frozen=True)

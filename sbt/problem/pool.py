@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
+from sbt.errors import InputError
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.requirement import Requirement
+from sbt.problem.space import ParameterSpace
 
 __all__ = ["Pool"]
 
@@ -47,6 +49,26 @@ class Pool:
     def repeats(self) -> bool:
         """Whether some inputs have several rows."""
         return len(self._rows) < len(self.x)
+
+    def within(self, own: ParameterSpace, space: ParameterSpace) -> Pool:
+        """Return the rows that are feasible in a space, its choices coded as there; `own` is the space that they are of now.
+
+        Raises:
+            InputError: fewer than two are.
+        """
+        x = np.array(self.x)
+        for k, (old, new) in enumerate(zip(own.parameters, space.parameters, strict=True)):
+            if old.choices:
+                place = [new.choices.index(choice) if choice in new.choices else -1 for choice in old.choices]
+                x[:, k] = np.array(place)[x[:, k].astype(np.intp)]
+        kept = space.feasible(x)
+        every, left = len(kept), int(kept.sum())
+        if left < 2:
+            raise InputError(f"inputs and constraints must admit at least two of the {every:,} recorded rows, but admit {left}")
+        if left == every:
+            return replace(self, x=x)
+        note = f"{every - left:,} of {every:,} recorded rows lie outside of the inputs' ranges or constraints, and are left out."
+        return replace(self, x=x[kept], metrics={name: y[kept] for name, y in self.metrics.items()}, notes=(*self.notes, note))
 
     def y(self, metric: str) -> Vector:
         """Return (n,) values of a metric."""

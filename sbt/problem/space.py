@@ -67,8 +67,7 @@ class ParameterSpace:
             if isinstance(formula, Expression):
                 self.check_formula(formula)
         if self.constraints and self._feasible_share < _MIN_FEASIBLE:
-            rules = "; ".join(text for text, _ in self.constraints)
-            raise InputError(f"constraints must leave at least {_MIN_FEASIBLE:g} of the box, but '{rules}' leave less")
+            raise InputError(f"constraints must leave at least {_MIN_FEASIBLE:g} of the box, but '{self.rules}' leave less")
 
     def _check_correlation(self) -> None:
         matrix = np.asarray(self.correlation, dtype=np.float64)
@@ -205,10 +204,19 @@ class ParameterSpace:
 
     def feasible(self, x: Points) -> Mask:
         """Return (n,) booleans: in the ranges and all constraints hold."""
-        mask = np.all([p.contains(x[:, k]) for k, p in enumerate(self.parameters)], axis=0)
+        return np.asarray(np.all([p.contains(x[:, k]) for k, p in enumerate(self.parameters)], axis=0) & self.satisfied(x))
+
+    def satisfied(self, x: Points) -> Mask:
+        """Return (n,) booleans: all constraints hold."""
+        mask = np.ones(len(x), dtype=bool)
         for _, predicate in self.constraints:
             mask &= np.asarray(predicate(self.columns(x)), dtype=bool)
         return mask
+
+    @property
+    def rules(self) -> str:
+        """The constraints as text."""
+        return "; ".join(text for text, _ in self.constraints)
 
     def from_unit(self, u: Points) -> Points:
         """Map (n, d) unit-cube coordinates to physical values, along the ranges (not the distribution)."""
@@ -355,8 +363,7 @@ class ParameterSpace:
                 raise InputError(f"input {p.name} must be {kind}in {p.range}, but got {value:g}")
         full = self.named(x)
         if self.constraints and not bool(self.feasible(x[None])[0]):
-            rules = "; ".join(text for text, _ in self.constraints)
-            raise InputError(f"inputs must satisfy '{rules}', but got {written(full)}")
+            raise InputError(f"inputs must satisfy '{self.rules}', but got {written(full)}")
         return full
 
 

@@ -8,7 +8,8 @@ import numpy as np
 from scipy.special import erfcx, log_ndtr
 
 from sbt.problem.arrays import Points, Vector
-from sbt.samplers.search import Picks, Search, WarpedModel, fill_uniformly, fit_warped, log_repulsion, refine_best, search_data
+from sbt.samplers.room import fill_uniformly
+from sbt.samplers.search import Picks, Search, WarpedModel, fit_warped, log_repulsion, refine_best, search_data
 
 __all__ = [
     "CRITERIA", "Criterion", "log_expected_improvement", "lower_confidence_bound", "probability_of_violation", "propose_by",
@@ -92,7 +93,7 @@ def propose_by(
     search, y = search.reached(u, y)
     seen = search_data(search, u, y, batch, rng)
     if len(seen.u) < 2:
-        return Picks(fill_uniformly(seen.admissible, n, d, rng), (name,) * n)
+        return Picks(fill_uniformly(seen.filling(search, rng), n, d, rng), (name,) * n)
     model = fit_warped(search, seen.u, seen.y, rng, seen.success)
     margin = model.critical.margin(model.warp.values(seen.y))
     start = seen.u[np.argsort(margin, kind="stable")[:_STARTS]]

@@ -14,16 +14,15 @@ from sbt.metamodels.base import fitted, predicted, sample_paths
 from sbt.metamodels.bootstrap import drawn_regression
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.samplers.noise import by_chance, scores
+from sbt.samplers.room import fill_uniformly, spread_out
 from sbt.samplers.search import (
     Picks,
     Search,
     SearchData,
     WarpedModel,
-    fill_uniformly,
     fit_warped,
     log_repulsion,
     refine_best,
-    spread_out,
 )  # fmt: skip
 
 __all__ = ["propose_in_noise"]
@@ -92,7 +91,8 @@ def propose_in_noise(
             value = drawn_regression(inputs, score, points, rng, trees=kind == 1)
         picks.append(int(among[np.argmin(value)]))
     chosen = np.vstack([largest, candidates[np.array(picks, dtype=np.intp)]])
-    chosen = np.vstack([chosen, spread_out(seen.admissible, np.vstack([known, chosen]), filled, rng, search.cube)])
+    room = seen.filling(search, rng)
+    chosen = np.vstack([chosen, spread_out(room, np.vstack([known, chosen]), filled, rng, search.cube)])
     why = ("rate",) * len(largest) + ("drawn",) * len(picks) + ("fill",) * filled
     order = np.argsort(predicted(process, search.columns(chosen)).mu, kind="stable")
     return Picks(chosen[order], tuple(why[k] for k in order))

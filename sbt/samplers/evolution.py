@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import importlib.util
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
 from sbt.errors import InputError
-from sbt.problem.arrays import Points, Vector
+from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.cube import CONTINUOUS, Cube
+from sbt.samplers.room import fill_uniformly
 from sbt.samplers.search import Picks
 from sbt.seeds import stream
 
@@ -19,6 +20,7 @@ __all__ = ["propose", "require"]
 
 _SIGMA = 0.3  # of the unit cube, at each start: the range is about 3 sigma wide, as Hansen (2016) recommends
 _FAILED = 1e9  # stands for the margin of a failed run: worse than all others
+_DRAWN_AGAIN, _TIMES = 256, 64  # points at once in place of infeasible ones; of a narrow space uniform ones after so many times
 
 
 def require() -> None:
@@ -31,12 +33,16 @@ def require() -> None:
         raise InputError("acquisition cma_es needs the library cma, but it is not installed: pip install 'sumo-sbt[compare]'")
 
 
-def propose(start: Vector, margins: Sequence[Vector], n: int, seed: int, cube: Cube = CONTINUOUS) -> Picks:
+def propose(
+    start: Vector, margins: Sequence[Vector], n: int, seed: int, cube: Cube = CONTINUOUS,
+    feasible: Callable[[Points], Mask] = lambda u: np.ones(len(u), dtype=bool),
+) -> Picks:  # fmt: skip
     """Return the next n points of a covariance matrix adaptation evolution strategy.
 
     The same seed and margins give the same points: earlier generations are drawn again and given their
     margins. A strategy that has converged is restarted at a random point. An input with choices has a coordinate for each
-    of them, and takes the one of the largest: the strategy never moves between choices along their list.
+    of them, and takes the one of the largest: the strategy never moves between choices along their list. Infeasible points are
+    drawn again.
 
     Args:
         start: (d,) where the first one starts, in the unit cube.
@@ -44,9 +50,10 @@ def propose(start: Vector, margins: Sequence[Vector], n: int, seed: int, cube: C
         n: points wanted >= 1.
         seed: of the campaign.
         cube: which coordinates take single values.
+        feasible: (m, d) points to (m,) booleans.
 
     Raises:
-        InputError: the library is not installed.
+        InputError: the library is not installed, or no point is feasible.
 
     Source:
         Hansen (2016), The CMA evolution strategy: a tutorial, arXiv 1604.00772; library pycma.
@@ -55,14 +62,29 @@ def propose(start: Vector, margins: Sequence[Vector], n: int, seed: int, cube: C
     first = cube.embedded(start[None])[0]
     d, restarts = len(first), 0
     strategy = _started(first, n, seed, restarts)
-    for values in margins:
-        generation = strategy.ask(len(values))
+
+    def points(embedded: Points) -> Points:
+        return cube.restored(np.clip(embedded, 0.0, 1.0), len(start))
+
+    def asked(size: int, number: int) -> Points:
+        found = np.array(strategy.ask(size)).reshape(size, -1)[:, :d]
+        bad = np.flatnonzero(~feasible(points(found)))
+        for _ in range(_TIMES):
+            if len(bad) == 0:
+                return found
+            again = np.array(strategy.ask(_DRAWN_AGAIN)).reshape(_DRAWN_AGAIN, -1)[:, :d]
+            again = again[feasible(points(again))][: len(bad)]
+            found[bad[: len(again)]], bad = again, bad[len(again) :]
+        found[bad] = cube.embedded(fill_uniformly(feasible, len(bad), len(start), stream(seed, "cma", "feasible", number)))
+        return found
+
+    for number, values in enumerate(margins):
+        generation = list(asked(len(values), number))
         strategy.tell(generation, np.where(np.isfinite(values), values, _FAILED).tolist())
         if strategy.stop():
             restarts += 1
             strategy = _started(stream(seed, "cma", "restart", restarts).random(d), n, seed, restarts)
-    points: Points = np.clip(np.array(strategy.ask(n)), 0.0, 1.0).reshape(n, -1)[:, :d]
-    return Picks(cube.restored(points, len(start)), ("cma_es",) * n)
+    return Picks(points(asked(n, len(margins))), ("cma_es",) * n)
 
 
 def _started(start: Vector, n: int, seed: int, restarts: int) -> Any:

@@ -142,7 +142,7 @@ def select_diverse(u: Points, log_score: Vector, existing: Points, n: int, scale
     at = u * scale
     nearest = cKDTree(existing * scale).query(at)[0] ** 2 if len(existing) else np.full(len(u), float(len(scale)))
     selected: list[int] = []
-    while len(selected) < n:
+    while len(selected) < min(n, len(u)):
         with np.errstate(divide="ignore"):
             value = log_score + np.log(nearest)
         best = int(np.argmax(value))
@@ -174,7 +174,7 @@ def select_representative(u: Points, weight: Vector, existing: Points, n: int, s
         Nemhauser, Wolsey and Fisher (1978), doi 10.1007/BF01588971: the greedy selection reaches at least
         1 - 1/e of the largest possible reduction. Lazy evaluation: Minoux (1978), doi 10.1007/BFb0006528.
     """
-    if n == 0:
+    if n == 0 or len(u) == 0:
         return np.empty(0, dtype=np.int64)
     at = u * scale
     between = cdist(at, at, "sqeuclidean")

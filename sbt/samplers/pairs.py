@@ -17,7 +17,8 @@ from sbt.metamodels.extra_trees import ExtraTrees, ForestPredictor
 from sbt.metamodels.risk import fit_process
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.samplers.noise import scores
-from sbt.samplers.search import Search, fill_uniformly
+from sbt.samplers.room import fill_uniformly
+from sbt.samplers.search import Search
 from sbt.seeds import SEED_END
 
 __all__ = ["PairPicks", "propose_pairs"]

@@ -15,7 +15,8 @@ from scipy.special import log_ndtr
 
 from sbt.metamodels.base import fitted, named_errors, predicted
 from sbt.problem.arrays import Mask, Points, Vector
-from sbt.samplers.search import Search, SearchData, fill_uniformly
+from sbt.samplers.room import fill_uniformly
+from sbt.samplers.search import Search, SearchData
 
 __all__ = ["beneath_plateaus", "plateau"]
 

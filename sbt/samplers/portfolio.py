@@ -7,7 +7,6 @@ time, nothing is remembered between batches.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -18,17 +17,16 @@ from sbt.samplers.drawn import propose_in_noise
 from sbt.samplers.noise import hidden_by_noise, more_repeats
 from sbt.samplers.plateaus import beneath_plateaus, plateau
 from sbt.samplers.regions import PATIENCE, Region, clusters, niches, regions
+from sbt.samplers.room import Room, fill_uniformly, spread_out
 from sbt.samplers.search import (
     Picks,
     Search,
     SearchData,
     WarpedModel,
-    fill_uniformly,
     fit_warped,
     log_repulsion,
     refine_best,
     search_data,
-    spread_out,
 )  # fmt: skip
 
 __all__ = ["Region", "propose", "regions"]
@@ -87,7 +85,7 @@ def propose(
     again = _repeats(search, seen, u, y, n) if repeats else ()
     n -= len(again)
     if len(seen.u) < 2:
-        return Picks(fill_uniformly(seen.admissible, n, d, rng), ("global",) * n, again)
+        return Picks(fill_uniformly(seen.filling(search, rng), n, d, rng), ("global",) * n, again)
     if repeats and seen.noisy and hidden_by_noise(u, search.margins(y)):
         return replace(propose_in_noise(search, seen, search.critical.margin(seen.y), n, rng, u), repeat=again)
     seen = seen.thinned(search.critical.margin(seen.y), search.most_rows, rng)
@@ -115,12 +113,12 @@ def propose(
     filled = min(filled, n - len(small) - len(under))
     thompson = min(round((_THOMPSON_LATE if stagnant else _THOMPSON) * n), n - len(small) - filled)
     thompson = thompson if len(small) == 0 else min(thompson, (n - len(small)) // 2)
-    drawn = _thompson(model, hopeful, max(thompson - len(under), 0), d, rng)
+    room, drawn = seen.filling(search, rng), _thompson(model, hopeful, max(thompson - len(under), 0), d, rng)
     picks = np.vstack([drawn, small, under])
-    picks = np.vstack([picks, spread_out(seen.admissible, np.vstack([u, pending, picks]), filled, rng, search.cube)])
+    picks = np.vstack([picks, spread_out(room, np.vstack([u, pending, picks]), filled, rng, search.cube)])
     why = ("thompson",) * len(drawn) + ("niche",) * len(small) + ("beneath",) * len(under) + ("fill",) * filled
     why += ("global",) * (n - len(picks))
-    picks = _globally(model, picks, n, u, pending, hopeful, seen.admissible, rng, search.cube)
+    picks = _globally(model, picks, n, u, pending, hopeful, seen.admissible, room, rng, search.cube)
     order = np.argsort(-model.log_probability(picks), kind="stable")
     return Picks(picks[order], tuple(why[k] for k in order), again)
 
@@ -207,7 +205,7 @@ def _thompson(model: WarpedModel, niches: list[tuple[Region, Points]], n: int, d
 
 def _globally(
     model: WarpedModel, picks: Points, n: int, u: Points, pending: Points, niches: list[tuple[Region, Points]],
-    admissible: Callable[[Points], Mask], rng: np.random.Generator, cube: Cube,
+    admissible: Room, filling: Room, rng: np.random.Generator, cube: Cube,
 ) -> Points:  # fmt: skip
     """Return the picks and further ones, n in all: the largest P(critical), every second time inflated.
 
@@ -224,7 +222,7 @@ def _globally(
     for k in range(n - len(picks)):
         at = int(np.argmax(scores[k % 2] + away))
         if scores[k % 2][at] <= np.log(_HOPELESS):
-            picks = np.vstack([picks, spread_out(admissible, np.vstack([u, pending, picks]), 1, rng, cube)])
+            picks = np.vstack([picks, spread_out(filling, np.vstack([u, pending, picks]), 1, rng, cube)])
             continue
         picks = np.vstack([picks, candidates[at]])
         away += log_repulsion(at_candidates, at_candidates[at][None], _CLEAR * np.sqrt(d))

@@ -27,26 +27,25 @@ from sbt.problem.cube import CONTINUOUS, Cube
 from sbt.problem.requirement import CriticalInterval, as_reached
 from sbt.samplers.free_region import FreeRegion
 from sbt.samplers.noise import hidden_by_noise
+from sbt.samplers.room import Room, fill_uniformly
 
 __all__ = [
-    "DEFLATION", "Picks", "Search", "SearchData", "WarpedModel", "deflate", "fill_uniformly", "fit_warped",
-    "log_repulsion", "refine_best", "search_data", "spread_out",
+    "DEFLATION", "Picks", "Search", "SearchData", "WarpedModel", "deflate", "fit_warped", "log_repulsion", "refine_best",
+    "search_data",
 ]  # fmt: skip
 
 DEFLATION = 0.22
 """Half the side of the box around a critical run that the search leaves alone (unit cube); see docs/measured/falsification.md."""
-_LEAST_FREE = 0.05  # of the space that deflation must leave: below, too few of the uniform candidates are admissible
+_LEAST_FREE = 0.05  # of where runs are worth it that deflation must leave: below, too few uniform candidates are admissible
 _FLANK = 0.15  # beyond a deflated box: runs there are near-critical for what is known already
 _PROBES = 512  # points that the free share is estimated from, to a hundredth
 _CANDIDATES = 1500  # uniform ones: a proposal of ten takes 0.06 s at 50 runs, 0.5 s at 500 (docs/measured/falsification.md)
 _STEPS = (0.1, 0.03)  # standard deviations of the steps from the best candidates, in the unit cube, round by round
 _BEST, _CHILDREN = 30, 10  # candidates that are refined in a round, steps from each
 _MOVED = 0.3  # share of the coordinates that a step changes: others stay, which pays where few inputs matter
-_MOST_TRIES, _MOST_AT_ONCE = 2**18, 2**14  # to find admissible points: 260 where a thousandth is feasible
 _PRIOR_RUNS = 2.0  # what the metamodel's P(critical) weighs beside repetitions of a run
 _MOST_SEEDS, _CERTAIN, _DOUBTFUL = 0.5, 0.9, 0.3  # failure rates: deflated from, without repetition from, left alone below
 _MOST_REPEATED, _MOST_EXCHANGED = 3, 60  # runs of the same inputs, after which their basin is left as it is; critical runs
-_FARTHEST_OF, _FARTHEST_OF_FEW = 30, 3  # uniform points, the farthest of which fills a gap: around the edges, and plainly
 
 
 @dataclass(frozen=True)
@@ -176,11 +175,12 @@ def fit_warped(search: Search, u: Points, y: Vector, rng: np.random.Generator, s
     return WarpedModel(predictor, search.columns, warp, critical, search.metamodel, len(y), success)
 
 
-def deflate(search: Search, hits: Points, rng: np.random.Generator, dimension: int) -> FreeRegion:
-    """Return what deflation leaves; the radius is halved until that is at least 5 % of the space."""
-    probe = rng.random((_PROBES, dimension))
-    probe = probe[search.feasible(probe)] if search.feasible(probe).any() else probe
-    probe, hits = search.cube.embedded(probe), search.cube.embedded(hits)
+def deflate(
+    search: Search, hits: Points, rng: np.random.Generator, dimension: int, room: Callable[[Points], Mask] | None = None
+) -> FreeRegion:
+    """Return what deflation leaves; the radius is halved until that is at least 5 % of the room, or of all that is feasible."""
+    probe = search.cube.embedded(fill_uniformly(room or search.feasible, _PROBES, dimension, rng))
+    hits = search.cube.embedded(hits)
     radius = search.deflation
     while radius > 1e-6 and FreeRegion.without(hits, radius)(probe).mean() < _LEAST_FREE:
         radius /= 2
@@ -194,7 +194,8 @@ class SearchData:
     Args:
         u, y, batch: (m, d), (m,), (m,) runs that neither failed nor lie in a deflated basin.
         flank: (m,) the run lies just outside of a deflated basin: near-critical for what is known already.
-        admissible: (n, d) points to (n,) booleans: feasible, not deflated, and a run there may well give a metric.
+        admissible: where to look: feasible, not deflated, and a run there may well give a metric; where there is no such point
+            the deflated ones, too, and last all that is feasible.
         failed, failed_batch: (k, d), (k,) runs that gave no metric.
         rows: (m,) which of the runs they are.
         noisy: equal inputs gave different metrics.
@@ -208,7 +209,7 @@ class SearchData:
     y: Vector
     batch: Vector
     flank: Mask
-    admissible: Callable[[Points], Mask]
+    admissible: Room
     failed: Points
     failed_batch: Vector
     rows: NDArray[np.intp]
@@ -216,6 +217,10 @@ class SearchData:
     last_hit: float = -np.inf
     undecided: tuple[int, ...] = ()
     success: LogSuccess | None = None
+
+    def filling(self, search: Search, rng: np.random.Generator) -> Room:
+        """Return where points fill space: each admissible one with P(a run there gives a metric)."""
+        return self.admissible if self.success is None else _succeeding(search, self.success, self.admissible, rng)
 
     def thinned(self, margin: Vector, most: int, rng: np.random.Generator) -> SearchData:
         """Return the same with at most so many runs to learn from: a tenth of them of least margin (m,), the others drawn."""
@@ -252,22 +257,45 @@ def search_data(search: Search, u: Points, y: Vector, batch: Vector | None, rng:
     undecided: tuple[int, ...] = ()
     if noisy and hit.any():
         deflated, undecided = _decided(search, u, y, ok, hit, rng)
-    free = deflate(search, _in_other_choices(search, u, y, ok, deflated, rng), rng, u.shape[1])
-    at = search.cube.embedded
-    left = ok & ~deflated & free(at(u))
-    flank = ~free(at(u[left]), _FLANK)
     success = search.learn_success(search.columns(u), ok, rng)
 
-    def admissible(points: Points) -> Mask:
-        left = search.feasible(points) & free(at(points))
+    def worth(points: Points) -> Mask:
+        left = np.array(search.feasible(points), dtype=bool)
         if success is not None and left.any():  # it costs a prediction
             left[left] = np.isfinite(success(search.columns(points[left])))
         return left
 
+    room = search.feasible if success is None else Room(worth, search.feasible)
+    likely = None if success is None else _succeeding(search, success, search.feasible, rng)
+    free = deflate(search, _in_other_choices(search, u, y, ok, deflated, rng), rng, u.shape[1], likely)
+    at = search.cube.embedded
+    left = ok & ~deflated & free(at(u))
+    flank = ~free(at(u[left]), _FLANK)
+
+    def admits(points: Points) -> Mask:
+        left = np.array(free(at(points)), dtype=bool)
+        if left.any():
+            left[left] = room(points[left])
+        return left
+
     return SearchData(
-        u[left], y[left], number[left], flank, admissible, u[~ok], number[~ok], np.flatnonzero(left), noisy, last_hit, undecided,
-        success,
+        u[left], y[left], number[left], flank, Room(admits, room), u[~ok], number[~ok], np.flatnonzero(left), noisy, last_hit,
+        undecided, success,
     )  # fmt: skip
+
+
+def _succeeding(
+    search: Search, success: LogSuccess, room: Callable[[Points], Mask] | Room, rng: np.random.Generator
+) -> Room:  # fmt: skip
+    """Return where a random point of a room lies with P(a run there gives a metric)."""
+
+    def drawn(points: Points) -> Mask:
+        left = np.array(room(points), dtype=bool)
+        if left.any():
+            left[left] = rng.random(int(left.sum())) < np.exp(success(search.columns(points[left])))
+        return left
+
+    return Room(drawn, room)
 
 
 def _in_other_choices(search: Search, u: Points, y: Vector, ok: Mask, deflated: Mask, rng: np.random.Generator) -> Points:
@@ -303,41 +331,6 @@ def _decided(search: Search, u: Points, y: Vector, ok: Mask, hit: Mask, rng: np.
     rows = np.flatnonzero(open_)
     _, first = np.unique(group[rows], return_index=True)
     return deflated, tuple(int(k) for k in rows[first][np.argsort(-rate[rows[first]], kind="stable")])
-
-
-def fill_uniformly(admissible: Callable[[Points], Mask], n: int, d: int, rng: np.random.Generator) -> Points:
-    """Return (n, d) uniform admissible points, of at most 260,000 tries.
-
-    Where fewer are found they come again; where none is (all is deflated), points are uniform in the cube.
-    """
-    found, tries, size = np.empty((0, d)), 0, max(100, n)
-    while len(found) < n and tries < _MOST_TRIES:
-        u = rng.random((size, d))
-        found = np.vstack([found, u[admissible(u)]])
-        tries, size = tries + size, min(2 * size, _MOST_AT_ONCE)
-    if len(found) == 0:
-        return rng.random((n, d))
-    return found[:n] if len(found) >= n else np.vstack([found, found[rng.integers(0, len(found), n - len(found))]])
-
-
-def spread_out(
-    admissible: Callable[[Points], Mask], others: Points, n: int, rng: np.random.Generator, cube: Cube = CONTINUOUS
-) -> Points:
-    """Return (n, d) points that fill the gaps among the others (m, d): each the farthest of some uniform admissible ones.
-
-    Of 30 points distances go around the edges of the cube: without that the farthest ones are corners. A crowd at one edge then
-    keeps them from the opposite one, too, so that every second point is the farthest of three by plain distances.
-    """
-    d = others.shape[1]
-    found = np.empty((0, d))
-    for k in range(n):
-        plain = k % 2 == 1 if n > 1 else bool(rng.integers(2))
-        candidates = fill_uniformly(admissible, _FARTHEST_OF_FEW if plain else _FARTHEST_OF, d, rng)
-        there = cube.embedded(np.vstack([others, found]))
-        apart = np.abs(cube.embedded(candidates)[:, None, :] - there[None])
-        nearest = ((apart if plain else np.minimum(apart, 1.0 - apart)) ** 2).sum(axis=2).min(axis=1)
-        found = np.vstack([found, candidates[int(np.argmax(nearest))]])
-    return found
 
 
 def refine_best(

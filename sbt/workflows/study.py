@@ -329,7 +329,7 @@ class Study:
         if self.config.ahead and not any(ahead_of(stage) for stage in found.stages):
             kind, how = self.config.campaign, self.config.acquisition.kind
             raise InputError(f"batch.ahead must be 0 where each batch needs all results before it, as in {kind} by {how}")
-        return replace(found, recorded=self.scenario.pool)
+        return replace(found, recorded=self.scenario.pool, space=self.scenario.space)
 
     @property
     def budget(self) -> int:
