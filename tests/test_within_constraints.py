@@ -188,3 +188,28 @@ def test_of_no_candidates_none_is_selected() -> None:
     none, at = np.empty((0, 2)), np.full((1, 2), 0.5)
     assert len(select_diverse(none, np.empty(0), at, 3, np.ones(2))) == 0
     assert len(select_representative(none, np.empty(0), at, 3, np.ones(2))) == 0
+
+
+def test_combinations_are_few_where_few_are_feasible(tmp_path: Path) -> None:
+    """35 of 27,000: 45 of 80 runs were repetitions, one combination was never run, and nothing said that all were."""
+
+    def scenario(rule: str) -> sbt.Scenario:
+        holds = (rule, lambda v: v["x"] + v["y"] + v["z"] > float(rule.split()[-1]))
+        space = sbt.ParameterSpace(tuple(WHOLE), constraints=(holds,))
+        return sbt.Scenario("few", space, sbt.Requirement("y", high=86.5), evaluate=lambda v, seed: {"y": total(v)})
+
+    few = scenario("x + y + z > 85")
+    result = sbt.run(campaign="boundary", scenario=few, budget=80, store=tmp_path / "edge", executor="serial", report=False)
+    assert len(result.frame[["x.x", "x.y", "x.z"]].drop_duplicates()) == 35
+    assert len(result.frame) <= 45  # some are repeated to learn whether there is noise
+    assert result.summary["stopped"] == "all combinations"
+    summed = sbt.run(campaign="estimation", scenario=few, budget=80, store=tmp_path / "sum", executor="serial", report=False)
+    assert summed.conclusion.probability == pytest.approx(15 / 35)
+    grid = np.array(np.meshgrid(*[np.arange(1, 31)] * 3, indexing="ij")).reshape(3, -1).T
+    for least, known in ((85, True), (62, True), (61, False)):
+        space = scenario(f"x + y + z > {least}").space
+        if known:
+            assert space.combinations is not None
+            assert space.from_unit(space.combinations).tolist() == grid[grid.sum(axis=1) > least].tolist()
+        else:
+            assert space.combinations is None

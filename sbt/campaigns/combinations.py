@@ -21,24 +21,22 @@ __all__ = ["ALL_RUN", "EveryCombination", "all_run", "combinations_left", "every
 
 ALL_RUN = "all combinations"
 """Why a campaign stops that has run every combination of its inputs."""
-_MOST = 4096  # combinations that are kept account of
 _CANDIDATES = 1024  # points of which the farthest from all runs takes the place of a repetition
 
 
 def combinations_left(scenario: LogicalScenario, history: History) -> Points | None:
     """Return the feasible combinations (m, d) that were not run yet, in the inputs' units.
 
-    None where repetitions are worth a run: an input is continuous, there are more than 4,096 combinations, equal inputs gave
+    None where repetitions are worth a run: an input is continuous, there are more than 4,096 of them, equal inputs gave
     different metrics, or all were run and noise would hardly show (`SimulatorNoise.silent`); also for recorded tables, whose
     rows are never repeated.
     """
     space = scenario.space
-    points = space.cube.combinations(space.dimension, _MOST)
+    points = space.combinations
     noise = simulator_noise(history, scenario.requirement)
     if points is None or scenario.pool is not None or noise.noisy:
         return None
     x = space.from_unit(points)
-    x = x[space.feasible(x)]
     gone = {tuple(row) for row in _cells(space, history.x)}
     left = x[[tuple(row) not in gone for row in _cells(space, x)]]
     return None if noise.silent and not len(left) else left

@@ -14,7 +14,6 @@ from sbt.problem.scenario import LogicalScenario
 
 __all__ = ["CriticalCombinations", "critical_combinations"]
 
-_MOST = 4096  # combinations that are looked at
 _TOLD, _NAMED = 3, 4  # combinations, and inputs, that a sentence tells
 
 
@@ -50,10 +49,9 @@ def critical_combinations(
 ) -> CriticalCombinations | None:
     """Return the critical combinations by the metamodel; None without any, with a continuous input, or with more than 4,096."""
     space = scenario.space
-    u = space.cube.combinations(space.dimension, _MOST)
+    u = space.combinations
     if u is None:
         return None
-    u = u[space.feasible(space.from_unit(u))]
     odds = log_odds(u) if len(u) else np.empty(0)
     critical = np.flatnonzero((odds > 0.0) & succeeding(log_success, u))
     if not len(critical):

@@ -36,8 +36,6 @@ _REPLICATE = "replicate"
 """Stage of further runs of a combination, of a noisy simulator."""
 _REST = "rest"
 """Stage of random draws among the combinations that the noise left without a run of their own; log_q is that among them."""
-_MOST = 4096
-"""Combinations that are looked at."""
 _WORSE = 1.2
 """Variance over that of as many random draws, where noise decides every run, from which on not all combinations are run."""
 _SELDOM, _FEWEST = 0.5, 5
@@ -250,11 +248,10 @@ def summed(log: Log, settings: Settings, requirement: Requirement | None = None)
 
 def _combinations(space: ParameterSpace) -> tuple[Points, Vector] | None:
     """Return the combinations (m, d) that have a probability, and those (m,), the likeliest first; None: not few."""
-    cells = space.cube.combinations(space.dimension, _MOST)
+    cells = space.combinations
     if cells is None:
         return None
     x = space.from_unit(cells)
-    x = x[space.feasible(x)]
     p = np.exp(np.sum([each.log_density(x[:, k]) for k, each in enumerate(space.parameters)], axis=0))
     order = np.argsort(-p, kind="stable")
     order = order[p[order] > 0.0]

@@ -26,9 +26,6 @@ __all__ = [
     "notes_of", "proposed", "sentences_of",
 ]  # fmt: skip
 
-_FEW = 4096
-"""Combinations of whole numbers and choices that are kept account of."""
-
 BACK = "back to the first stage"
 """What a later stage says instead of why it is over: its runs have told that an earlier one is not."""
 
@@ -167,9 +164,8 @@ def notes_of(scenario: LogicalScenario) -> tuple[str, ...]:
 
 def few_combinations(scenario: LogicalScenario) -> int | None:
     """Return the number of combinations of whole numbers and choices that can be run; None where they are not few."""
-    space = scenario.space
-    points = None if scenario.pool is not None else space.cube.combinations(space.dimension, _FEW)
-    return None if points is None else int(space.feasible(space.from_unit(points)).sum())
+    points = None if scenario.pool is not None else scenario.space.combinations
+    return None if points is None else len(points)
 
 
 class Stage(Protocol):

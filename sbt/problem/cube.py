@@ -7,16 +7,19 @@ to one than to another, so that a distance, a step or a metamodel must not be to
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from sbt.problem.arrays import Points, Vector
+from sbt.problem.arrays import Mask, Points, Vector
 
 __all__ = ["CONTINUOUS", "Cube"]
 
 _SIDE = math.sqrt(0.5)
 """Coordinate of a choice on its own axis: two choices are as far apart as the ends of a range."""
+_LOOKED_AT, _AT_ONCE = 2**22, 2**16
+"""Points of which feasible ones are counted, in all and at once; more have 4,096 feasible ones where a thousandth is."""
 
 
 @dataclass(frozen=True)
@@ -47,17 +50,26 @@ class Cube:
         """Return (n, w + c) positions of the whole numbers and choices at points u (n, d); zeros where there are none."""
         return np.column_stack([np.zeros(len(u)), *(_cell(u[:, k], n) for k, n in (*self.whole, *self.nominal))])
 
-    def combinations(self, dimension: int, most: int) -> Points | None:
+    def combinations(self, dimension: int, most: int, feasible: Callable[[Points], Mask] | None = None) -> Points | None:
         """Return all points (m, d) that can be run; None where a coordinate is continuous, or there are more than `most`.
+
+        Where only some are `feasible`, these count; of more than four million points it is not asked.
 
         >>> Cube(whole=((0, 2),), nominal=((1, 2),)).combinations(2, 10).tolist()
         [[0.25, 0.25], [0.25, 0.75], [0.75, 0.25], [0.75, 0.75]]
         """
         counts = dict((*self.whole, *self.nominal))
-        if len(counts) < dimension or math.prod(counts.values()) > most:
+        total = math.prod(counts.values())
+        if len(counts) < dimension or total > (most if feasible is None else _LOOKED_AT):
             return None
-        ends = [(np.arange(counts[k]) + 0.5) / counts[k] for k in range(dimension)]
-        return np.stack([axis.ravel() for axis in np.meshgrid(*ends, indexing="ij")], axis=1)
+        shape, found = tuple(counts[k] for k in range(dimension)), np.empty((0, dimension))
+        for start in range(0, total, _AT_ONCE):
+            cells = np.unravel_index(np.arange(start, min(start + _AT_ONCE, total)), shape)
+            points = (np.stack(cells, axis=1) + 0.5) / shape
+            found = np.vstack([found, points if feasible is None else points[feasible(points)]])
+            if len(found) > most:
+                return None
+        return found
 
     def snapped(self, u: Points) -> Points:
         """Return the points (n, d) that are run in place of u: single values at the middle of their interval."""

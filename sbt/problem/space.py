@@ -24,6 +24,7 @@ Formula = Callable[[Mapping[str, Any]], Any]
 _MASS_POINTS, _MOST_MASS_POINTS = 2**15, 2**22
 _ADMISSIBLE = 20_000  # points that a mass is told by: its error is below 1 %
 _MIN_FEASIBLE = 1e-3
+_FEW = 4096  # combinations that are kept account of
 _SCORES_LEAST, _SCORES_MOST = 64, 2**17  # candidates of which admissible scores are kept, at once
 _FAR_SCORES, _TOLD = np.arange(5.0, 38.01, 0.05), 0.5
 """Normal scores up to that from which on float64 knows no probability, and by how much a value may miss its own."""
@@ -128,6 +129,12 @@ class ParameterSpace:
         """Where in the unit cube the values of whole-number inputs and choices lie."""
         counts = [(k, len(p.choices), round(p.high - p.low) + 1) for k, p in enumerate(self.parameters) if p.discrete]
         return Cube(tuple((k, n) for k, m, n in counts if not m), tuple((k, m) for k, m, _ in counts if m))
+
+    @cached_property
+    def combinations(self) -> Points | None:
+        """The feasible combinations (m, d) of whole numbers and choices, in the unit cube; None where they are not few."""
+        feasible = (lambda u: self.feasible(self.from_unit(u))) if self.constraints else None
+        return self.cube.combinations(self.dimension, _FEW, feasible)
 
     @cached_property
     def choices(self) -> dict[str, tuple[str, ...]]:
