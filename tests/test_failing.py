@@ -9,7 +9,7 @@ import pytest
 
 import sbt
 from sbt import testbeds
-from sbt.metamodels.success import failure_probability, log_success
+from sbt.metamodels.success import failure_probability, learned_success
 from sbt.seeds import stream
 
 AWAY = 0.25
@@ -70,14 +70,14 @@ def test_every_method_stays_there(method: str, seed: int, tmp_path: Path):
 def test_p_of_success_is_a_probability_and_never_learned_from_success_alone():
     rng = stream(3, "success")
     u = rng.random((60, 2))
-    assert log_success(u, np.ones(60, bool), rng) is None
-    assert log_success(u, np.zeros(60, bool), rng) is None
-    score = log_success(u, u[:, 0] < 0.5, rng)
+    assert learned_success(u, np.ones(60, bool), rng) is None
+    assert learned_success(u, np.zeros(60, bool), rng) is None
+    score = learned_success(u, u[:, 0] < 0.5, rng)
     assert score is not None
     inside, outside = np.array([[0.1, 0.5]]), np.array([[0.9, 0.5]])
     assert np.exp(score(inside)) > 0.9
     assert score(outside) == -np.inf
-    at_random = log_success(u, rng.random(60) < 0.8, rng)  # failures that no input explains
+    at_random = learned_success(u, rng.random(60) < 0.8, rng)  # failures that no input explains
     assert at_random is not None
     assert np.exp(at_random(rng.random((500, 2)))).mean() == pytest.approx(0.8, abs=0.12)
 

@@ -17,7 +17,6 @@ from sbt.estimators.binomial import interval
 from sbt.loop.learner import FittedMetamodel
 from sbt.loop.stages import Log
 from sbt.metamodels.base import simplest
-from sbt.metamodels.success import learned_success
 from sbt.problem.arrays import Mask, Points
 from sbt.samplers.free_region import FreeRegion
 from sbt.samplers.plateaus import plateau
@@ -154,7 +153,7 @@ def search_of(settings: Settings) -> Search:
         raise ValueError("exploration needs a metamodel")
     return Search(
         scenario.requirement.critical, simplest(settings.learner.metamodel), space.metamodel_inputs,
-        lambda u: space.feasible(space.from_unit(u)), cube=space.cube, most_rows=_MOST_ROWS, learn_success=learned_success,
+        lambda u: space.feasible(space.from_unit(u)), cube=space.cube, most_rows=_MOST_ROWS,
     )  # fmt: skip
 
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from sbt.metamodels.extra_trees import ForestPredictor
     from sbt.metamodels.gaussian_process import GaussianProcessPredictor
 
-__all__ = ["LogSuccess", "Success", "failure_probability", "learned_success", "log_success"]
+__all__ = ["LogSuccess", "Success", "failure_probability", "learned_success"]
 
 LogSuccess = Callable[[Points], Vector]
 """(n, d) metamodel inputs -> (n,) log P(a run there gives a metric) <= 0, -inf where one is not worth the try."""
@@ -67,7 +67,7 @@ class Success:
 def learned_success(u: Points, ok: Mask, rng: np.random.Generator) -> Success | None:
     """Return log P(a run gives a metric), of which shares of the space can be told; None where all runs gave one, or none.
 
-    `log_success` smooths small places away in which all runs fail (docs/measured/boundary.md).
+    Least squares on labels would smooth small places away in which all runs fail (docs/measured/boundary.md).
 
     Args:
         u: (n, d) metamodel inputs of all runs.
@@ -80,7 +80,7 @@ def learned_success(u: Points, ok: Mask, rng: np.random.Generator) -> Success | 
     if len(u) <= _MOST_EXACT:
         found = classifier(u, ok, rng)
         return Success(found, found.ends, least, found.gain)
-    predictor = _fitted(u, ok, rng, input_noise=False)
+    predictor = _fitted(u, ok, rng)
 
     def ends(points: Points) -> tuple[Vector, Vector]:
         p = np.clip(predictor(points).mu, 0.0, 1.0)
@@ -89,35 +89,6 @@ def learned_success(u: Points, ok: Mask, rng: np.random.Generator) -> Success | 
     few = rng.permutation(len(u))[:_COMPARED]
     gain = classifier(u[few], ok[few], rng).gain if 0 < ok[few].sum() < len(few) else 0.0
     return Success(lambda points: predictor(points).mu, ends, least, gain)
-
-
-def log_success(u: Points, ok: Mask, rng: np.random.Generator) -> LogSuccess | None:
-    """Return log P(a run gives a metric) as a function of the metamodel's inputs; None where all runs did, or none: for searches.
-
-    A Gaussian process is fitted to the labels 0 and 1, and P is its mean: far from all runs that is the share of those that
-    succeed. Its log likelihood on new points was that of a Laplace-approximated classifier (docs/measured/falsification.md).
-    Where P is so small that a run would most likely be lost, the log is -inf.
-
-    Args:
-        u: (n, d) metamodel inputs of all runs.
-        ok: (n,) the run gave a metric.
-        rng: of the fit.
-
-    Labels are certainly noisy: without noise P would be 0 or 1 from run to run.
-
-    Source:
-        Least-squares classification: Rasmussen and Williams (2006), Gaussian processes for machine learning, section 6.5.
-    """
-    if len(u) < 2 or ok.all() or not ok.any():
-        return None
-    predictor, least = _fitted(u, ok, rng, input_noise=True), min(_LEAST, _LEAST_OF_BASE * float(ok.mean()))
-
-    def score(points: Points) -> Vector:
-        p = np.clip(predictor(points).mu, 0.0, 1.0)
-        with np.errstate(divide="ignore"):
-            return np.asarray(np.log(np.where(p < least, 0.0, p)))
-
-    return score
 
 
 def failure_probability(u: Points, ok: Mask, rng: np.random.Generator) -> Callable[[Points], Vector]:
@@ -132,15 +103,15 @@ def failure_probability(u: Points, ok: Mask, rng: np.random.Generator) -> Callab
         rng: of the fit.
     """
     least = 1.0 / (len(u) + 2.0)
-    predictor = _fitted(u, ok, rng, input_noise=False)
+    predictor = _fitted(u, ok, rng)
     return lambda points: np.clip(1.0 - predictor.mu(points), least, 1.0 - least)
 
 
-def _fitted(u: Points, ok: Mask, rng: np.random.Generator, *, input_noise: bool) -> GaussianProcessPredictor | ForestPredictor:
+def _fitted(u: Points, ok: Mask, rng: np.random.Generator) -> GaussianProcessPredictor | ForestPredictor:
     """Return a predictor of the labels 0 and 1: a Gaussian process, or a forest where there are many."""
     from sbt.metamodels.extra_trees import ExtraTrees
     from sbt.metamodels.gaussian_process import GaussianProcess
 
     if len(u) <= _MOST_EXACT:
-        return GaussianProcess(certainly_noisy=True, input_noise=input_noise, kernels=1).fit(u, ok.astype(np.float64), rng)
+        return GaussianProcess(certainly_noisy=True, input_noise=False, kernels=1).fit(u, ok.astype(np.float64), rng)
     return ExtraTrees().fit(u, ok.astype(np.float64), rng)

@@ -19,7 +19,7 @@ from sbt.metamodels.base import Metamodel, Predictor, fitted, gives_different, n
 from sbt.metamodels.joint import metamodel_for
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.saturation import on_side
-from sbt.metamodels.success import LogSuccess, log_success
+from sbt.metamodels.success import LogSuccess, learned_success
 from sbt.metamodels.warp import JointWarp, Warp, warp_around
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.combination import MARGIN, CombinedInterval
@@ -70,7 +70,7 @@ class Search:
     deflation: float = DEFLATION
     cube: Cube = CONTINUOUS
     most_rows: int = 4000
-    learn_success: Callable[[Points, Mask, np.random.Generator], LogSuccess | None] = log_success
+    learn_success: Callable[[Points, Mask, np.random.Generator], LogSuccess | None] = learned_success
 
     def reached(self, u: Points, y: Vector) -> tuple[Search, Vector]:
         """Return the search without an end of M_c that the metric ends at, and the metric with what stands for none on its side.
