@@ -73,9 +73,10 @@ class EveryCombination:
 
     def sentences(self, scenario: str, condition: str) -> list[str]:
         """Return the share, what it does not tell, and what to do next."""
+        are = "is" if self.critical == 1 else "are"
         return [
-            f"{self.critical:,} of all {self.combinations:,} combinations of the inputs of {scenario} are critical ({condition}),"
-            f" {percent(self.share)}: every one was run, and metrics did not change where runs were repeated.",
+            f"{self.critical:,} of all {self.combinations:,} combinations of the inputs of {scenario} {are} critical"
+            f" ({condition}), {percent(self.share)}: every one was run, and metrics did not change where runs were repeated.",
             "This does not tell how probable critical runs are in traffic, since every combination counts the same.",
             "Next: campaign: estimation weighs the combinations by their probability; result.frame and export list them.",
         ]

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import ndtri
 
 from sbt.campaigns.clustering import Spread, spread_of_draws, spread_of_share
 from sbt.campaigns.counting import DRAWN, FEW_KNOWN, Seen, counted_batches, counted_iterations, with_event
@@ -28,7 +30,8 @@ __all__ = [
 ]  # fmt: skip
 
 _CONFIDENCE = 0.95
-_CORRELATED = 0.3  # |correlation| of residuals from which on P(critical) of a combination is doubted
+_LEVEL = 0.05  # at which the largest correlation of residuals is no chance, of all pairs together
+_CORRELATED, _FEW = 0.3, 30  # |correlation| from which on P(critical) of a combination is off; runs that do not tell how much
 
 
 @dataclass(frozen=True)
@@ -194,9 +197,10 @@ def independence_words(found: Independence | None) -> list[str]:
         return []
     names = " and ".join(found.between)
     said = f"Residuals of {names} correlate by {number(found.correlation, 2)} on {found.runs} held-out runs"
-    if abs(found.correlation) * np.sqrt(found.runs) < 2.0:
+    if abs(found.correlation) * math.sqrt(found.runs - 1.0) < -ndtri(0.5 * _LEVEL / (found.pairs or 1)):
         return [f"{said}: no sign that the requirements are not independent given the inputs."]
-    much = "slightly off" if abs(found.correlation) < _CORRELATED else "off"
-    told = f"{said}: P(critical) of the combination takes them as independent, and is {much} where both are unsure"
+    much = "is slightly off" if abs(found.correlation) < _CORRELATED else "is off"
+    much = "may be off" if found.runs < _FEW else much
+    told = f"{said}: P(critical) of the combination takes them as independent, and {much} where both are unsure"
     often = "likelier" if found.together else "less likely"
     return [f"{told}{'' if found.together is None else f': both at once are {often} than it states'}."]

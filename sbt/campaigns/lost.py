@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from sbt.campaigns.wording import percent, plural
 from sbt.loop.stages import Facts
 
 __all__ = [
-    "decides_bound", "decides_share", "equally_near", "failed_runs", "lost_runs", "nearest_words", "none_gave_a_metric",
-    "nothing_known", "repetitions", "why_they_fail",
+    "decides_bound", "equally_near", "failed_runs", "lost_runs", "nearest_words", "none_gave_a_metric", "nothing_known",
+    "repetitions", "runs_to_halve", "why_they_fail",
 ]  # fmt: skip
 
 _HALF = 0.5
@@ -56,9 +58,17 @@ def lost_runs(lost: int, n: int) -> str:
     return f"{lost:,} of {plural(n, 'run')} gave no metric: the lower end counts them as uncritical, the upper end as critical"
 
 
-def decides_share(lost: int, n: int, low: float, high: float) -> bool:
-    """Return whether failed runs make up half of the width of an interval of a share, which more runs then never halve."""
-    return lost > 0 and lost / max(n, 1) >= _HALF * (high - low)
+def runs_to_halve(lost: int, n: int, low: float, high: float) -> float:
+    """Return how many more runs halve the interval of a share of n; inf where failed ones make up half of its width.
+
+    The width is the share of failed runs, which stays, and what shrinks with the root of their number.
+
+    >>> runs_to_halve(0, 100, 0.2, 0.4), round(runs_to_halve(12, 100, 0.266, 0.582), -2), runs_to_halve(20, 100, 0.2, 0.6)
+    (300.0, 2600.0, inf)
+    """
+    failing, width = lost / max(n, 1), high - low
+    left = _HALF * width - failing
+    return n * (((width - failing) / left) ** 2 - 1.0) if left > 0.0 else math.inf
 
 
 def decides_bound(worst: float, bound: float) -> str | None:

@@ -74,7 +74,8 @@ class SimulatorNoise:
         if self.lost is None:
             return self._of_metrics(metric, unit)
         places = "the same inputs" if self.lost == 1 else f"{self.lost} inputs"
-        said = f"With equal inputs and other seeds a run may give a metric or none, as at {places}: what fails is noisy."
+        alike = f"at {places} a run gave a metric, and one with another seed gave none"
+        said = f"The seed decides, too, whether a run fails: {alike}."
         return [said, *(self._of_metrics(metric, unit) if self.noisy else ())]
 
     def _of_metrics(self, metric: str, unit: str) -> list[str]:

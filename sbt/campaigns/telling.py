@@ -15,13 +15,13 @@ from sbt.campaigns.gate import CONDITION
 from sbt.campaigns.linking import modes_counted
 from sbt.campaigns.lost import (
     decides_bound,
-    decides_share,
     equally_near,
     lost_runs,
     nearest_words,
     none_gave_a_metric,
     nothing_known,
     repetitions,
+    runs_to_halve,
     why_they_fail,
 )  # fmt: skip
 from sbt.campaigns.modes import most_often, single
@@ -61,14 +61,14 @@ def tell_share(share: CriticalShare, facts: Facts) -> list[str]:
         further = "campaign: falsification searches for the rare critical run; as many even runs again only halve the bound"
     elif share.critical_fraction == 1.0:
         further = widening(facts.recorded)
-    elif decides_share(lost, share.counted, share.low, share.high):
+    elif (more := runs_to_halve(lost, share.counted, share.low, share.high)) > _TOO_FAR:
         further = f"failed runs decide the width of this interval, and more runs never halve it: {why_they_fail()}"
     elif (warm_ups := _deciding_warm_ups(share, facts)) is not None:
         further = _more_warm_ups(warm_ups)
     else:
         further = (
             f"campaign: boundary says where critical runs lie, {estimating(facts.recorded)} how probable they are; about"
-            f" {rounded(3 * share.counted):,} more runs would halve this interval"
+            f" {rounded(more):,} more runs would halve this interval"
         )
     return [
         f"{said}, by {runs} spread evenly over it{f'; {lost_runs(lost, share.counted)}' if lost else ''}.",
@@ -185,12 +185,18 @@ def tell_failures(found: FalsificationConclusion, random: CriticalShare, facts: 
     return [said, f"{silent}.", f"Next: {more}."]
 
 
+def _met(run: int, value: float | None, facts: Facts) -> str:
+    """Return the metric of a run in words; a value of None is infinite, and the run says which."""
+    if value is None:
+        value = float(facts.requirement.told(facts.history)[facts.history.index == run][0])
+    return measured(facts.requirement.told_as, value, facts.unit)
+
+
 def _worst(mode: FailureMode, facts: Facts) -> str:
     """Return the deepest failure and how often it came back, in words."""
-    metric, history = facts.requirement.told_as, facts.history
-    margins = facts.requirement.margins(history)
+    history, margins = facts.history, facts.requirement.margins(facts.history)
     one = "one of the worst" if equally_near(facts) > 1 else "the worst"
-    said = f"{one}, run {mode.representative} ({measured(metric, mode.metric, facts.unit)})"
+    said = f"{one}, run {mode.representative} ({_met(mode.representative, mode.metric, facts)})"
     if np.isfinite(margins).any():
         deepest = int(history.index[int(np.nanargmin(margins))])
         own = history.index == mode.representative
@@ -229,7 +235,7 @@ def _nothing_found(found: FalsificationConclusion, facts: Facts) -> list[str]:
             further += f", or campaign: coverage with 300 runs, which bounds that by {percent(_SMALL_SHARE)} {none}"
     closest = found.closest
     if closest is not None:
-        further += f"; {nearest_words(closest.run, measured(facts.requirement.told_as, closest.metric, facts.unit), facts)}"
+        further += f"; {nearest_words(closest.run, _met(closest.run, closest.metric, facts), facts)}"
     silent += ", and a failure in a small part of the space may be there."
     return [f"{said}.", silent, f"Next: {_every_combination(facts)}{further}."]
 

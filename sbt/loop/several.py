@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import combinations
 from typing import Any
 
@@ -63,7 +64,9 @@ def independence(parts: Sequence[Requirement], prediction: JointPrediction, y: P
             sides = _side(parts[i].critical) * _side(parts[j].critical)
             together = None if sides == 0 else correlation * sides > 0
             found.append(Independence((parts[i].label, parts[j].label), correlation, len(a), together))
-    return max(found, key=lambda one: abs(one.correlation)) if found else None
+    if not found:
+        return None
+    return replace(max(found, key=lambda one: abs(one.correlation)), pairs=len(found) if len(found) > 1 else None)
 
 
 def _side(critical: CriticalInterval) -> int:

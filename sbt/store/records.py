@@ -125,12 +125,14 @@ class Independence:
         correlation: of the ranks of their residuals on runs that no metamodel had seen; 0 where they are independent.
         runs: of which it was taken.
         together: whether both are critical at once more often than it states; None: a critical interval has two ends.
+        pairs: of requirements, of which this one was chosen; None: there is but one.
     """
 
     between: tuple[str, str]
     correlation: float
     runs: int
     together: bool | None = optional()
+    pairs: int | None = optional()
 
 
 @dataclass(frozen=True)
