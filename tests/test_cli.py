@@ -615,13 +615,3 @@ def test_status_says_how_far_a_campaign_is_and_watching_one_that_nobody_runs_end
     said = call("status", str(store(folder / "s")), "--watch").stdout
     assert re.search(r"/s: interrupted, 3 of \d+ runs$", said.splitlines()[0]), said
     assert "not finished: it was interrupted; run it again to go on" in said
-
-
-def test_the_end_of_a_command_looks_at_no_object_again():
-    """The interpreter looked through all objects of all libraries for cycles: an interrupted campaign went on for seconds."""
-    code = (
-        "import atexit, gc, sys; atexit.register(lambda: print('frozen', gc.get_freeze_count() > 10_000))\n"
-        "sys.argv = ['sumo-sbt', 'list', 'campaigns']\nfrom sbt.cli import main\nmain()"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=100)
-    assert done.stdout.endswith("frozen True\n"), done.stderr

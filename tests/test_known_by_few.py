@@ -71,7 +71,7 @@ def test_where_no_place_is_likely_critical_no_share_is_told_as_known(tmp_path: P
     inputs = [sbt.Parameter("a", 0.0, 1.0), sbt.Parameter("b", 0.0, 1.0)]
     scenario = sbt.Scenario("dropout", inputs, sbt.Requirement("y", high=0.0), evaluate=dropout)
     result = sbt.run(
-        campaign="boundary", scenario=scenario, budget=100, seed=1, executor="serial", store=tmp_path / "s", report=False
+        campaign="boundary", scenario=scenario, budget=100, seed=5, executor="serial", store=tmp_path / "s", report=False
     )
     first = result.sentences()[0]
     assert "% of the parameter space of dropout is critical" not in first
@@ -116,7 +116,7 @@ def test_a_requirement_that_no_run_violated_may_hold_what_its_draws_leave(tmp_pa
     )  # fmt: skip
     for found in (result.conclusion, result.estimate({"a": sbt.Normal(0.1, 1.0)})):
         assert found.high > 10.0 * found.probability > 0.0
-        assert any(text.startswith("no run violated impact, whose metric had one value in all runs") for text in found.warnings)
+        assert any(text.startswith("no run violated impact, whose metric had one value or none in all runs") for text in found.warnings)
         assert any(text.startswith("no run violated gap: the interval has of it what its") for text in found.warnings)
     whole, parts = result.conclusion, result.conclusion.requirements
     assert whole.high >= parts[1].high

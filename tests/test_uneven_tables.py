@@ -109,6 +109,32 @@ def test_points_that_crowd_are_not_spread_evenly(space: ParameterSpace) -> None:
     assert not spread_evenly(space, space.from_unit(diagonal))
 
 
+@pytest.mark.parametrize("levels", [(20, 20, 20), (10, 10, 10), (5, 5, 5, 5), (3,) * 6, (2,) * 10, (100, 3), (50, 5)])
+@pytest.mark.parametrize("centred", [False, True])
+def test_grids_are_spread_evenly(levels: tuple[int, ...], centred: bool) -> None:
+    """Ties were taken for points that crowd: a finer grid was denied where a coarser one was not."""
+    space = ParameterSpace(tuple(sbt.Parameter(name, 0, 1) for name in "abcdefghij"[: len(levels)]))
+    axes = [(np.arange(n) + 0.5) / n if centred else np.linspace(0.0, 1.0, n) for n in levels]
+    x = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(levels))
+    assert spread_evenly(space, x)
+    assert not spread_evenly(space, x[x[:, 0] < 0.5]), "half of the space has none"
+
+
+def test_even_points_of_what_constraints_leave_are_spread_evenly() -> None:
+    space = ParameterSpace(tuple(PLANE), constraints=(("a + b < 1", lambda v: v["a"] + v["b"] < 1.0),))
+    x = qmc.Sobol(2, rng=2).random(1024)
+    x = x[space.satisfied(x)]
+    assert spread_evenly(space, x)
+    assert not spread_evenly(space, x[x[:, 0] < 0.3])
+
+
+def test_whoever_made_a_table_may_say_that_it_is_even(exports: dict[str, Path], tmp_path: Path) -> None:
+    config = (exports["boundary"] / "config.yml").read_text()
+    (tmp_path / "config.yml").write_text(config.replace("spread_evenly: false", "spread_evenly: true"))
+    (tmp_path / "runs.csv").write_bytes((exports["boundary"] / "runs.csv").read_bytes())
+    assert load("scenarios", f"table:{tmp_path}").uneven == ""
+
+
 BOTH = """inputs: {a: {type: continuous, min: 0, max: 1}, b: {type: continuous, min: 0, max: 1}}
 outputs: {y: {type: continuous}}
 """

@@ -12,6 +12,7 @@ from sbt.campaigns.counting import Seen, counted_batches, counted_iterations, ra
 from sbt.campaigns.records import EXPLORE, EstimationProposal, PoolSummary
 from sbt.campaigns.repeats import simulator_noise
 from sbt.campaigns.settings import Settings
+from sbt.campaigns.unviolated import Unviolated
 from sbt.estimators.importance import Plan
 from sbt.estimators.intervals import FEWEST_HITS, WIDEST, combine_estimates
 from sbt.loop.stages import Log
@@ -121,8 +122,14 @@ def spared(pilot: Plan, shares: tuple[float, ...], draws: float, target: float |
 def is_precise(log: Log, settings: Settings, target: float | None) -> bool:
     """Return whether the estimate has this coefficient of variation, such as that at which `stop.cov` ends the campaign.
 
-    The interval must be narrow as well: where one large error decides the variance, its coefficient says little.
+    The interval must be narrow as well: where one large error decides the variance, its coefficient says little, and what draws
+    leave to a requirement that nothing else is known of is narrowed by draws alone.
     """
+    return _is_narrow(log, settings, target) and not Unviolated.of(log.history, settings).untold
+
+
+def _is_narrow(log: Log, settings: Settings, target: float | None) -> bool:
+    """Return whether the estimate is precise, but for what draws alone tell of."""
     counted = counted_batches(log, settings)
     if target is None or len(counted) < FEWEST_BATCHES:
         return False
@@ -153,10 +160,11 @@ def not_met(log: Log, settings: Settings, counted: int | None, bound: float) -> 
     Args:
         log: of the campaign.
         settings: of the campaign.
-        counted: runs of the estimate; where they are all random draws, their limits have what no run has met.
+        counted: runs of the estimate; where they are all random draws, or there is a requirement that nothing else is known of,
+            limits have what no run has met.
         bound: `undetected_mass_bound` of the conclusion, where no draws tell.
     """
-    if settings.gate is None or counted == random_draws(log.history) > 0:
+    if settings.gate is None or counted == random_draws(log.history) > 0 or Unviolated.of(log.history, settings).untold:
         return 0.0
     seen = Seen.of(log, settings)
     return seen.most(seen.surprises, settings.gate.confidence) if seen.draws else bound
@@ -165,7 +173,7 @@ def not_met(log: Log, settings: Settings, counted: int | None, bound: float) -> 
 def only_unseen(log: Log, settings: Settings) -> bool:
     """Return whether a gate lacks nothing but draws that bound what no run has met: none since the last count was a surprise."""
     target = settings.stop.get("cov")
-    enough = is_precise(log, settings, _TARGET if target is None else target)
+    enough = _is_narrow(log, settings, _TARGET if target is None else target)
     if settings.gate is None or not enough or not trusts_search(log, settings):
         return False
     return Seen.of(log, settings).surprised <= counted_iterations(log)[-1]

@@ -57,7 +57,7 @@ class Unviolated:
         """Return what the interval has of them, in words; so many draws leave them that probability at most."""
         said = []
         if self.untold:
-            names, value = " and ".join(self.untold), "metric had one value" if len(self.untold) == 1 else "metrics had one value"
+            names, value = " and ".join(self.untold), f"metric{'' if len(self.untold) == 1 else 's'} had one value or none"
             leave = f"the upper end has what {draws} leave to it, {number(most, 2)} at most"
             said.append(f"no run violated {names}, whose {value} in all runs: {leave}")
         rest = [name for name in self.names if name not in self.untold]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import os
 import signal
 from typing import TYPE_CHECKING, Any
@@ -36,12 +35,9 @@ def main() -> None:
     from sbt.cli.console import process
     from sbt.cli.verbs import app
 
-    try:
-        with process():
-            starting.active = False
-            app(prog_name="sumo-sbt")
-    finally:
-        gc.freeze()  # else the interpreter's end looks through all objects of all libraries, which takes seconds
+    with process():
+        starting.active = False
+        app(prog_name="sumo-sbt")
 
 
 def __getattr__(name: str) -> Any:

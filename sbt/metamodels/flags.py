@@ -23,6 +23,9 @@ from sbt.problem.requirement import CriticalInterval
 
 __all__ = ["FlagPredictor", "flag_process"]
 
+_MOST = 1000
+"""Runs of a noisy flag that are learned from at most, drawn at random: expectation propagation costs their cube."""
+
 
 @dataclass(frozen=True, eq=False)
 class FlagPredictor:
@@ -72,8 +75,11 @@ def flag_process(
     """
     if not gives_different(u, y):
         return rounded_process(two_ranges(y), critical, u, y, None, rng)
-    hit = critical.contains(y)
-    process = classifier(u, hit, rng)
-    belief = process.belief
-    ratio = (process.hyper.mean + belief.beside) / np.sqrt(1.0 + belief.wide)
+    hit, rows = critical.contains(y), np.sort(rng.permutation(len(y))[:_MOST])
+    if not hit[rows].any() or hit[rows].all():  # neither would be learned of
+        rows[0] = int(np.flatnonzero(hit != hit[rows[0]])[0])
+    process = classifier(u[rows], hit[rows], rng)
+    mean, variance = latent(u, process.u, process.hyper, process.belief)
+    mean[rows], variance[rows] = process.hyper.mean + process.belief.beside, process.belief.wide
+    ratio = mean / np.sqrt(1.0 + variance)
     return FlagPredictor(process, critical, float(np.ptp(y))), log_ndtr(np.where(hit, ratio, -ratio))

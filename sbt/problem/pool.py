@@ -29,14 +29,14 @@ class Pool:
         metrics: (n,) of each, by name.
         notes: in sentences, what whoever reads results of these rows must know of them.
         assumed: the requirement that nobody stated; None: one is stated.
-        guided: whoever made the table says that rows were chosen otherwise than to fill the space.
+        even: whoever made the table says that rows fill the space evenly, or that they do not; None: it is not said.
     """
 
     x: Points
     metrics: Mapping[str, Vector]
     notes: tuple[str, ...] = ()
     assumed: Requirement | None = None
-    guided: bool = False
+    even: bool | None = None
 
     @cached_property
     def _rows(self) -> dict[bytes, list[int]]:

@@ -214,11 +214,12 @@ class LogicalScenario:
     @cached_property
     def uneven(self) -> str:
         """Why shares of a recorded table's rows are none of the space; "" where rows are spread evenly, or any run can be had."""
-        if self.pool is None:
+        if self.pool is None or self.pool.even:
             return ""
-        if self.pool.guided:
+        if self.pool.even is False:
             return "they were chosen otherwise"
-        return "" if spread_evenly(self.space, self.pool.x) else "they crowd in parts of it"
+        crowd = "they seem to crowd in parts of it; spread_evenly: true in config.yml says that they do not"
+        return "" if spread_evenly(self.space, self.pool.x) else crowd
 
     @property
     def isolations(self) -> tuple[str, ...]:

@@ -80,7 +80,7 @@ def from_folder(name: str, folder: Path) -> LogicalScenario:
     even = described.get("spread_evenly")
     if even not in (None, True, False):
         raise InputError(f"{table.parent / 'config.yml'}: spread_evenly must be true or false, but got {even!r}")
-    pool = Pool(x, {column: rows[column][kept] for column in outputs}, notes, assumed, guided=even is False)
+    pool = Pool(x, {column: rows[column][kept] for column in outputs}, notes, assumed, even=even)
     title, text = str(described.get("title", path.name)), str(described.get("logical_scenario", ""))
     return LogicalScenario(
         name=f"table:{name}", space=space, requirement=need,

@@ -27,8 +27,8 @@ class Action(NamedTuple):
     """Command of a controller until the next step; None leaves a quantity as commanded before.
 
     Attributes:
-        acceleration: over the step (m/s^2); together with `speed`, until that speed is reached: one that
-            it leads away from (braking below it, 0 beside it) changes nothing.
+        acceleration: over the step (m/s^2); together with `speed`, until that speed is reached: braking below
+            it goes on, and whoever is faster does not accelerate.
         speed: at the end of the step (m/s); together with `pose`, the speed to record.
         lane: index on the current edge; starts a continuous lane change.
         pose: x, y (m) and heading (rad) of the centre at the end of the step, on or off the lanes.

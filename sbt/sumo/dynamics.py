@@ -18,7 +18,7 @@ _AT_TARGET = 1e-6
 def next_speed(speed: float, acceleration: float, target: float | None, dt: float) -> float:
     """Return the speed after a step of constant acceleration that ends at the target speed and at standstill (m/s).
 
-    A target that the acceleration leads away from is never reached: it changes nothing. NaN gives NaN.
+    Braking below the target never reaches it: it changes nothing. Above it nobody accelerates: the speed stays. NaN gives NaN.
     """
     reached = speed + acceleration * dt
     if target is not None:
@@ -26,8 +26,8 @@ def next_speed(speed: float, acceleration: float, target: float | None, dt: floa
             return target
         if acceleration < 0.0 and target <= speed + _AT_TARGET:
             reached = max(reached, target)
-        elif acceleration > 0.0 and target >= speed - _AT_TARGET:
-            reached = min(reached, target)
+        elif acceleration > 0.0:
+            reached = min(reached, target if target >= speed - _AT_TARGET else speed)
     return 0.0 if reached < 0.0 else reached
 
 

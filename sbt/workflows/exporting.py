@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sbt.acquisitions import even
 from sbt.campaigns.counting import NOMINAL, RANDOM
 from sbt.campaigns.failures import FILLING
 from sbt.campaigns.preventable import with_judgements
@@ -114,7 +113,7 @@ def _as_data_set(store: Store, study: Study) -> Path:
 def _fill_space(history: History, study: Study) -> bool:
     """Return whether all runs were chosen to fill the parameter space, whatever the results."""
     fill = set(FILLING)
-    if study.settings.acquisition is even:
+    if study.config.acquisition.kind == "even":
         fill |= set(history.stage.tolist()) - {CONFIRM}
     if all(parameter.distribution is None for parameter in study.scenario.space.parameters):
         fill |= {NOMINAL, RANDOM}
