@@ -116,7 +116,7 @@ def test_a_requirement_that_no_run_violated_may_hold_what_its_draws_leave(tmp_pa
     )  # fmt: skip
     for found in (result.conclusion, result.estimate({"a": sbt.Normal(0.1, 1.0)})):
         assert found.high > 10.0 * found.probability > 0.0
-        assert any(text.startswith("no run violated impact, whose metric had one value or none in all runs") for text in found.warnings)
+        assert any(text.startswith("no run violated impact, whose metric had one value or none") for text in found.warnings)
         assert any(text.startswith("no run violated gap: the interval has of it what its") for text in found.warnings)
     whole, parts = result.conclusion, result.conclusion.requirements
     assert whole.high >= parts[1].high
