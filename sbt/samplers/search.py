@@ -38,7 +38,7 @@ DEFLATION = 0.22
 """Half the side of the box around a critical run that the search leaves alone (unit cube); see docs/measured/falsification.md."""
 _LEAST_FREE = 0.05  # of where runs are worth it that deflation must leave: below, too few uniform candidates are admissible
 _FLANK = 0.15  # beyond a deflated box: runs there are near-critical for what is known already
-_PROBES = 512  # points that the free share is estimated from, to a hundredth
+_PROBES, _FEWEST_PROBES = 512, 100  # points of which those in the room tell the free share, to a few hundredths at least
 _CANDIDATES = 1500  # uniform ones: a proposal of ten takes 0.06 s at 50 runs, 0.5 s at 500 (docs/measured/falsification.md)
 _STEPS = (0.1, 0.03)  # standard deviations of the steps from the best candidates, in the unit cube, round by round
 _BEST, _CHILDREN = 30, 10  # candidates that are refined in a round, steps from each
@@ -179,8 +179,10 @@ def deflate(
     search: Search, hits: Points, rng: np.random.Generator, dimension: int, room: Callable[[Points], Mask] | None = None
 ) -> FreeRegion:
     """Return what deflation leaves; the radius is halved until that is at least 5 % of the room, or of all that is feasible."""
-    probe = search.cube.embedded(fill_uniformly(room or search.feasible, _PROBES, dimension, rng))
-    hits = search.cube.embedded(hits)
+    room, probe = room or search.feasible, rng.random((_PROBES, dimension))
+    probe = probe[room(probe)]
+    probe = probe if len(probe) >= _FEWEST_PROBES else fill_uniformly(room, _PROBES, dimension, rng)
+    probe, hits = search.cube.embedded(probe), search.cube.embedded(hits)
     radius = search.deflation
     while radius > 1e-6 and FreeRegion.without(hits, radius)(probe).mean() < _LEAST_FREE:
         radius /= 2
@@ -288,6 +290,7 @@ def _succeeding(
     search: Search, success: LogSuccess, room: Callable[[Points], Mask] | Room, rng: np.random.Generator
 ) -> Room:  # fmt: skip
     """Return where a random point of a room lies with P(a run there gives a metric)."""
+    rng = rng.spawn(1)[0]  # how often it is asked changes nothing else
 
     def drawn(points: Points) -> Mask:
         left = np.array(room(points), dtype=bool)
