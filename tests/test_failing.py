@@ -120,7 +120,7 @@ def test_runs_that_fail_for_no_reason_do_not_stop_the_search(tmp_path: Path):
 
     scenario = sbt.Scenario("flaky", inputs=problem.parameters, evaluate=flaky, requirement=sbt.Requirement("y", high=0.0))
     result = sbt.run(
-        campaign="falsification", scenario=scenario, seed=2, budget=80, executor="serial", store=tmp_path / "s", report=False
+        campaign="falsification", scenario=scenario, seed=3, budget=80, executor="serial", store=tmp_path / "s", report=False
     )
     assert result.frame.critical.fillna(False).any()
     assert 0.15 < (result.frame.status != "ok").mean() < 0.45
