@@ -31,9 +31,11 @@ def exports(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Return folders of 100 rows by kind of campaign: a third of a boundary's are critical."""
     folder, found = tmp_path_factory.mktemp("tables"), {}
     scenario = sbt.Scenario("twentieth", PLANE, sbt.Requirement("y", high=0.05), evaluate=twentieth)
-    for kind, more in (("coverage", {}), ("boundary", {"initial": 20, "batch": 20, "metamodel": "et"})):
-        made = sbt.run(campaign=kind, scenario=scenario, budget=100, store=folder / kind, **COMMON, **more)
-        found[kind] = made.export("dsiod").parent
+    small = {"initial": 20, "batch": 20, "metamodel": "et"}
+    for name, kind, more in (("coverage", "coverage", {}), ("boundary", "boundary", small),
+                             ("even", "boundary", {**small, "acquisition": "even"})):  # fmt: skip
+        made = sbt.run(campaign=kind, scenario=scenario, budget=100, store=folder / name, **COMMON, **more)
+        found[name] = made.export("dsiod").parent
     return found
 
 
@@ -69,8 +71,9 @@ def test_no_share_of_the_space_is_told_by_rows_that_results_chose(
     assert "not spread evenly over the parameter space" in checked.output
 
 
-def test_shares_of_the_space_are_told_by_even_rows(exports: dict[str, Path], tmp_path: Path) -> None:
-    table = exports["coverage"]
+@pytest.mark.parametrize("kind", ["coverage", "even"])
+def test_shares_of_the_space_are_told_by_even_rows(exports: dict[str, Path], tmp_path: Path, kind: str) -> None:
+    table = exports[kind]
     assert "spread_evenly" not in (table / "config.yml").read_text()
     found = sbt.run(campaign="coverage", scenario=f"table:{table}", budget=60, store=tmp_path / "s", **COMMON)
     assert "of the parameter space of table:" in found.sentences()[0]

@@ -18,7 +18,7 @@ from scipy.special import log_ndtr
 
 from sbt.problem.arrays import Points, Vector
 
-__all__ = ["Belief", "Hyper", "Priors", "believe", "fitted", "latent", "latent_jointly", "log_probability"]
+__all__ = ["Belief", "Hyper", "Priors", "believe", "fitted", "latent", "latent_paths", "log_probability"]
 
 _SWEEPS, _CLOSE, _DAMPED = 40, 1e-5, 0.8  # of expectation propagation: at most, change of log evidence that ends them, step
 _STEPS, _ENOUGH = 40, 1e-4  # of L-BFGS: at most, and relative gain that ends them
@@ -175,12 +175,15 @@ def latent(points: Points, u: Points, hyper: Hyper, belief: Belief) -> tuple[Vec
     return np.concatenate(means), np.concatenate(variances)
 
 
-def latent_jointly(points: Points, u: Points, hyper: Hyper, belief: Belief) -> tuple[Vector, Points]:
-    """Return mean (n,) and covariance (n, n) of the latent function at points (n, d) by rows u (m, d)."""
+def latent_paths(points: Points, u: Points, hyper: Hyper, belief: Belief, n: int, rng: np.random.Generator) -> Points:
+    """Return (n, m) draws of the latent function at points (m, d) by rows u; the cost is cubic in m."""
     at, scaled = points / hyper.lengths, u / hyper.lengths
     across = _matern(at, scaled)[0] * hyper.spread**2
     v = solve_triangular(belief.lower, np.sqrt(belief.precision)[:, None] * across.T, lower=True, check_finite=False)
-    return hyper.mean + across @ belief.pull, _matern(at, at)[0] * hyper.spread**2 - v.T @ v
+    mean, covariance = hyper.mean + across @ belief.pull, _matern(at, at)[0] * hyper.spread**2 - v.T @ v
+    values, vectors = np.linalg.eigh(covariance)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    return np.asarray(mean + rng.standard_normal((n, len(points))) @ root.T)
 
 
 def _moments(low: Vector, high: Vector, variance: Vector, noise: float) -> tuple[Vector, Vector, Vector, Vector]:

@@ -14,7 +14,7 @@ from scipy.special import log_ndtr
 
 from sbt.metamodels.base import gives_different
 from sbt.metamodels.classifier import Classifier, classifier
-from sbt.metamodels.expectation_propagation import latent, latent_jointly
+from sbt.metamodels.expectation_propagation import latent, latent_paths
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.rounded import RoundedPredictor, rounded_process, two_ranges
 from sbt.metamodels.sided import placed_by
@@ -54,10 +54,8 @@ class FlagPredictor:
 
     def sample_paths(self, u: Points, n: int, rng: np.random.Generator) -> Points:
         """Return (n, m) draws of the mean of y as a function at u (m, d), which is that of a rate; the cost is cubic in m."""
-        mean, covariance = latent_jointly(u, self.process.u, self.process.hyper, self.process.belief)
-        values, vectors = np.linalg.eigh(covariance)
-        drawn = rng.standard_normal((n, len(u))) @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
-        return placed_by(self.critical, -(mean + drawn), self.apart)[0]
+        drawn = latent_paths(u, self.process.u, self.process.hyper, self.process.belief, n, rng)
+        return placed_by(self.critical, -drawn, self.apart)[0]
 
 
 def flag_process(

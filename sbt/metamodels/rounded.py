@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
 from sbt.metamodels.base import Metamodel, gives_different
-from sbt.metamodels.expectation_propagation import Belief, Hyper, Priors, believe, fitted, latent, latent_jointly
+from sbt.metamodels.expectation_propagation import Belief, Hyper, Priors, believe, fitted, latent, latent_paths
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.stacking import surely_positive
 from sbt.metamodels.warp import Warp
@@ -171,10 +171,7 @@ class RoundedPredictor:
 
     def sample_paths(self, u: Points, n: int, rng: np.random.Generator) -> Points:
         """Return (n, m) draws of y as a function at u (m, d); the cost is cubic in m."""
-        mean, covariance = latent_jointly(u, self.u, self.hyper, self.belief)
-        values, vectors = np.linalg.eigh(covariance)
-        root = vectors * np.sqrt(np.maximum(values, 0.0))
-        return self._told(mean + rng.standard_normal((n, len(u))) @ root.T)[0]
+        return self._told(latent_paths(u, self.u, self.hyper, self.belief, n, rng))[0]
 
     def log_sides(self, u: Points, inside: Mask, rows: NDArray[np.intp]) -> Vector:
         """Return (n,) log P of the side of the edge on which runs at u (n, d) fell, those that it learned by all others."""

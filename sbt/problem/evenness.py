@@ -36,9 +36,10 @@ def spread_evenly(space: ParameterSpace, x: Points) -> bool:
     some_like = _independent(space, counts)
     for column, even in zip(_jittered(space, u, rng).T, _jittered(space, drawn, rng).T, strict=True):
         column = column if not space.constraints else np.searchsorted(np.sort(even), column) / len(even)
-        distance, n = _distance(column), min(some_like, len(np.unique(column)))
-        if _lacks_levels(np.unique(column), len(points)):
+        levels, distance = np.unique(column), _distance(column)
+        if _lacks_levels(levels, len(points)):
             return False
+        n = min(some_like, len(levels))
         if distance > _LARGE and float(kstwobign.sf(np.sqrt(n) * distance)) * space.dimension < _BY_CHANCE:
             return False
     if len(points) > _MOST:
