@@ -167,3 +167,21 @@ def test_critical_runs_somewhere_do_not_stand_for_runs_that_fill_the_space(tmp_p
     assert n < 150
     assert found.even_fraction.counted >= 1.0 / 0.02
     assert found.expected_misclassified + 0.5 / (found.even_fraction.counted + 1.0) <= 0.02
+
+
+def test_an_estimation_beside_a_requirement_that_nothing_violates_ends_when_draws_have_bounded_that(tmp_path: Path):
+    """It ended at run 165 with an upper end of 4.5 times the estimate, or never."""
+    need = sbt.any_of(sbt.Requirement("near", high=0.0), sbt.Requirement("hit", low=0.5))
+    inputs = [sbt.Parameter(name, 0.0, 1.0) for name in "ab"]
+    scenario = sbt.Scenario(
+        "beside", inputs, need, evaluate=lambda v, _: {"near": v["a"] + v["b"] - 0.5, "hit": 0.0}, metrics=["near", "hit"]
+    )
+    result = sbt.run(
+        campaign="estimation", scenario=scenario, budget=500, seed=0, executor="serial", store=tmp_path / "s", report=False
+    )
+    found = result.conclusion
+    assert result.summary["stopped"] == "cov"
+    assert 100 < len(result.frame) < 400
+    assert found.low <= 0.125 <= found.high
+    assert found.high - found.low <= 2.0 * 3.0 * 0.1 * found.probability
+    assert any(text.startswith("no run violated hit") for text in found.warnings)

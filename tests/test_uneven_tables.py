@@ -78,6 +78,9 @@ def test_shares_of_the_space_are_told_by_even_rows(exports: dict[str, Path], tmp
     found = sbt.run(campaign="coverage", scenario=f"table:{table}", budget=60, store=tmp_path / "s", **COMMON)
     assert "of the parameter space of table:" in found.sentences()[0]
     assert found.conclusion.rows is None
+    edge = sbt.run(campaign="boundary", scenario=f"table:{table}", budget=60, metamodel="et", store=tmp_path / "b", **COMMON)
+    assert edge.conclusion.even_fraction is None, "rows that guided runs leave are no random ones"
+    assert "fill the space evenly deny" not in edge.sentences()[0]
 
 
 def test_what_is_not_known_to_be_even_stays_so_from_table_to_table(exports: dict[str, Path], tmp_path: Path) -> None:

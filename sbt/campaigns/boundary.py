@@ -70,7 +70,7 @@ class BoundaryConclusion:
         earlier: runs of an earlier campaign that the metamodel learned from, too; 0: they do not help; None: there are none.
         critical_range: least and largest critical fraction, as runs fail or not where that is open; None: it hardly matters.
         even_fraction: critical share of all runs that fill the space evenly, the held-out ones among them; None: of recorded rows
-            that are not spread evenly none do.
+            those that guided runs left are no random ones.
         fails_by_chance: nothing shows that inputs decide which runs fail; None: none fails.
         failing_range: ends of the failing fraction; None: it is not known to be a part of the space.
         critical_combinations: where no input is continuous; None: one is, or the metamodel sees none.
@@ -179,7 +179,7 @@ def recipe(settings: Settings) -> Campaign:
             held_out, r.failing_fraction, stated_noise(log.history, settings.scenario), r.requirements, each, r.independence,
             place, explained_variance(settings, log.history, unchosen), traffic_doubt(settings, log.history),
             every, regions or None, r.earlier, None if every is not None else open_range(learner, fitted, len(met)),
-            None if settings.scenario.uneven else critical_share(log.history.where(unchosen), settings.scenario),
+            critical_share(log.history.where(unchosen), settings.scenario) if settings.scenario.pool is None else None,
             by_chance(fitted),
             failing_range(learner, fitted, len(log.history.finished)),
             None if every is not None else critical_combinations(log_odds, settings.scenario, fitted.log_success),

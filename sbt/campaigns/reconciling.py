@@ -29,10 +29,14 @@ def nowhere_likely(found: BoundaryConclusion, where: str, condition: str, few: s
     return f"{lead} by the metamodel, but {few}" if few else lead
 
 
-def denial(found: BoundaryConclusion, runs: CriticalShare) -> str:
-    """Return that held-out runs deny the share of the metamodel, or its certainty, or all even runs its share; else nothing."""
+def denial(found: BoundaryConclusion, runs: CriticalShare, *, recorded: bool = False) -> str:
+    """Return that held-out runs deny the share of the metamodel, or its certainty, or all even runs its share; else nothing.
+
+    Recorded rows that are left over deny its certainty alone, as in `reconciled`.
+    """
     share, held_out, every = found.critical_fraction or 0.0, _as_told(found, runs), _as_told(found, found.even_fraction)
-    denied = held_out is not None and not _holds(held_out, share) and not (every is not None and _holds(every, share))
+    denied = not recorded and held_out is not None and not _holds(held_out, share)
+    denied = denied and not (every is not None and _holds(every, share))
     whose = "held-out runs" if denied or _too_sure(found) else "runs that fill the space evenly" if _unlike_even(found) else None
     return "" if whose is None else f" The {whose} deny its figures (below): do not rely on it yet."
 

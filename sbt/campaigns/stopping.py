@@ -9,6 +9,7 @@ import numpy as np
 
 from sbt.campaigns.clustering import spread_of_draws
 from sbt.campaigns.counting import Seen, counted_batches, counted_iterations, random_draws
+from sbt.campaigns.gate import Limits
 from sbt.campaigns.records import EXPLORE, EstimationProposal, PoolSummary
 from sbt.campaigns.repeats import simulator_noise
 from sbt.campaigns.settings import Settings
@@ -122,10 +123,17 @@ def spared(pilot: Plan, shares: tuple[float, ...], draws: float, target: float |
 def is_precise(log: Log, settings: Settings, target: float | None) -> bool:
     """Return whether the estimate has this coefficient of variation, such as that at which `stop.cov` ends the campaign.
 
-    The interval must be narrow as well: where one large error decides the variance, its coefficient says little, and what draws
-    leave to a requirement that nothing else is known of is narrowed by draws alone.
+    The interval must be narrow as well: where one large error decides the variance, its coefficient says little. So must be
+    what draws leave to a requirement that nothing else is known of.
     """
-    return _is_narrow(log, settings, target) and not Unviolated.of(log.history, settings).untold
+    if target is None or not _is_narrow(log, settings, target):
+        return False
+    others, found = Unviolated.of(log.history, settings), combine_estimates(counted_batches(log, settings))
+    if not others.untold:
+        return True
+    seen, own = Seen.of(log, settings), Limits(lambda c: found.limit(c, side=-1), lambda c: found.limit(c, side=1))
+    limits = others.reached(own, lambda c: seen.most(seen.failed, c), seen.most_critical)
+    return 0.5 * (limits.upper(0.975) - limits.lower(0.975)) <= WIDEST * target * found.value
 
 
 def _is_narrow(log: Log, settings: Settings, target: float | None) -> bool:

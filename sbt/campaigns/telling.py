@@ -114,7 +114,7 @@ def tell_boundary(found: BoundaryConclusion, measured_share: CriticalShare, fact
     rests = f"the metamodel learned that from {plural(learned, 'run')}{f' and {found.earlier} earlier' if found.earlier else ''}"
     missing = "an uncritical" if all_critical(facts) else "a critical"
     said = [
-        f"{lead}; {rests}, and {sure}.{'' if facts.uneven else denial(found, measured_share)}",
+        f"{lead}; {rests}, and {sure}.{'' if facts.uneven else denial(found, measured_share, recorded=facts.recorded)}",
         f"This does not tell how probable critical runs are in traffic, since every part of the ranges counts the same; {missing}"
         f" region smaller than the gaps between {plural(learned, 'run')} may be missing from it.",
         f"Next: {_every_combination(facts)}{_after_boundary(found, facts, tested=tested)}.",
