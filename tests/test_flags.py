@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+import sbt
 from sbt.metamodels.automatic import Auto
 from sbt.metamodels.base import sample_paths
 from sbt.metamodels.expectation_propagation import Hyper, believe, latent
@@ -16,6 +18,7 @@ from sbt.metamodels.persistence import load, save
 from sbt.metamodels.prediction import Prediction
 from sbt.problem.arrays import Mask, Points
 from sbt.problem.requirement import CriticalInterval
+from sbt.samplers.sobol import SobolSequence
 from sbt.seeds import stream
 
 QUICK = Auto(**Auto.PRESETS["quick"])
@@ -99,3 +102,44 @@ def test_a_belief_whose_sweeps_end_is_that_of_its_rows():
     root = np.sqrt(belief.precision)
     np.testing.assert_allclose(belief.lower @ belief.lower.T, np.eye(len(u)) + root[:, None] * covariance * root, atol=1e-9)
     assert latent(at, u, hyper, belief)[1].min() > 1.0
+
+
+def disc(values: dict[str, float], seed: int) -> dict[str, float]:
+    """Return a flag that is 1 in a disc, one that never is, and how far right a run is."""
+    at = np.array([values["a"], values["b"]])
+    return {"hit": float(np.sum((at - [0.3, 0.6]) ** 2) < 0.03), "never": 0.0, "right": values["a"]}
+
+
+def run_of_flags(folder: Path, **given: Any) -> sbt.Result:
+    """Run a campaign on the disc."""
+    inputs = [sbt.Parameter("a", 0.0, 1.0), sbt.Parameter("b", 0.0, 1.0)]
+    scenario = sbt.Scenario("disc", inputs, sbt.Requirement("hit", low=0.5), evaluate=disc, metrics=["hit", "never", "right"])
+    return sbt.run(**given, scenario=scenario, store=folder, executor="serial", report=False)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_search_that_follows_values_of_a_flag_tells_its_sides(tmp_path: Path, seed: int):
+    found = run_of_flags(tmp_path / "s", campaign="falsification", budget=80, seed=seed)
+    at = SobolSequence(2, 7).points(0, 1024)
+    told = found.predict(at)["p_critical"].clip(1e-12, 1.0 - 1e-12)
+    hit = np.array([disc({"a": a, "b": b}, 0)["hit"] for a, b in at])
+    share = hit.mean()
+    guess = -share * np.log(share) - (1.0 - share) * np.log1p(-share)
+    assert -np.mean(hit * np.log(told) + (1.0 - hit) * np.log1p(-told)) < 0.6 * guess  # else two to four times as large
+
+
+@pytest.mark.parametrize("campaign", ["falsification", "boundary"])
+def test_what_no_run_was_may_be_all_the_same(tmp_path: Path, campaign: str):
+    single = sbt.Requirement("never", low=0.5)
+    found = run_of_flags(tmp_path / "single", campaign=campaign, budget=30, requirement=single)
+    inputs = len(np.unique(found.history.finished.x, axis=0))
+    at = {"a": [0.1, 0.9], "b": 0.5}
+    assert found.predict(at)["p_critical"].tolist() == pytest.approx([1.0 / (inputs + 2.0)] * 2)
+    either = {"any": [{"metric": "never", "critical": [0.5, None]}, {"metric": "right", "critical": [0.8, None]}]}
+    found = run_of_flags(tmp_path / "any", campaign=campaign, budget=30, requirement=either)
+    doubt = 1.0 / (len(np.unique(found.history.finished.x, axis=0)) + 2.0)
+    told = found.predict(at)
+    assert told["p_critical.never"].tolist() == pytest.approx([doubt] * 2)
+    assert told["p_critical"].tolist() == pytest.approx([doubt, 1.0], abs=1e-3)
+    drawn = found.fitted.predict(np.array([[0.1, 0.5]]))  # by figures and reports
+    assert drawn.probability(found.scenario.requirement.critical) == pytest.approx(doubt, abs=1e-3)

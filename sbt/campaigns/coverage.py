@@ -68,7 +68,7 @@ def recipe(settings: Settings) -> Campaign:
     """Return the campaign: one Sobol sequence in batches, a share held out where there is a metamodel."""
 
     def conclude(log: Log) -> tuple[CoverageConclusion, FittedMetamodel | None]:
-        fitted = settings.learner.fit(log.history) if settings.learner is not None else None
+        fitted = settings.learner.telling(log.history).fit(log.history) if settings.learner is not None else None
         share = critical_share(log.history, settings.scenario)
         pool = settings.scenario.pool
         validation = None if fitted is None else fitted.record.validation

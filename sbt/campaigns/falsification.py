@@ -66,7 +66,7 @@ def recipe(settings: Settings) -> Campaign:
     failures = FailureSearch(settings)
 
     def conclude(log: Log) -> tuple[FalsificationConclusion, FittedMetamodel | None]:
-        fitted = learner.fit(log.history)
+        fitted = learner.telling(log.history).fit(log.history)
         found = failures.conclusion(log, None if fitted is None else fitted.record)
         return replace(found, fidelity=screening_told(log, settings), earlier=earlier_told(log, settings)), fitted
 

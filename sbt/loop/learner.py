@@ -13,13 +13,14 @@ import numpy as np
 from sbt.loop.drawn_traffic import DrawnTraffic, decoded, encoded
 from sbt.loop.earlier import EarlierRuns
 from sbt.loop.several import each_requirement, independence
-from sbt.metamodels.base import Metamodel, Predictor, Screened, log_ambiguity_bound, named_errors, predicted, sketched
-from sbt.metamodels.joint import JointPrediction, JointPredictor, metamodel_for
+from sbt.metamodels.base import Metamodel, Predictor, Screened, is_flag, log_ambiguity_bound, named_errors, predicted, sketched
+from sbt.metamodels.joint import JointPrediction, JointPredictor, in_units, metamodel_for
 from sbt.metamodels.over_traffic import MeanOverTraffic, OverTrafficPredictor
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.saturation import scored
 from sbt.metamodels.scores import scores
 from sbt.metamodels.success import Success, learned_success
+from sbt.metamodels.unvaried import with_unvaried
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.combination import MARGIN
 from sbt.problem.scenario import LogicalScenario
@@ -101,6 +102,24 @@ class Learner:
         if rough is not predictor:
             sketch, quick = self.on_inputs(rough, len(training)), self._bound(rough)
         return FittedMetamodel(predict, record, seconds, self._bound(predictor), success, sketch, quick)
+
+    def telling(self, history: History) -> Learner:
+        """Return what learns metrics of two values for what is told of them: sides, where this one takes them for Gaussian."""
+        parts, runs = self.scenario.requirement.parts, history.finished
+        if not any(is_flag(part.values(runs), part.critical) for part in parts):
+            return self
+        from sbt.metamodels.automatic import Auto  # torch
+
+        auto: Metamodel = Auto(**Auto.PRESETS["quick"])
+        followed = self.metamodel == replace(Auto().simplest, kernels=1)  # by a search, unless another one is chosen
+        return replace(self, metamodel=auto if followed else self.metamodel, target_aware=True)
+
+    def told(self, predict: Predictor, history: History) -> Predictor:
+        """Return a predictor as it is told: margins in the units that those of the runs have, doubt of metrics of one value."""
+        requirement, runs = self.scenario.requirement.in_units_of(history), history.finished
+        return with_unvaried(
+            in_units(predict, requirement.critical), runs.x, [part.values(runs) for part in requirement.parts]
+        )  # fmt: skip
 
     def over_traffic(self, predictor: Predictor, history: History) -> tuple[Predictor, str | None]:
         """Return a predictor with P(critical) as the mean over traffic, and what a record keeps of it; or itself, None."""

@@ -23,7 +23,7 @@ from sbt.files import as_cell
 from sbt.loop.learner import Learner
 from sbt.metamodels.base import Predictor, predicted
 from sbt.metamodels.ended import ended
-from sbt.metamodels.joint import JointPrediction, in_units
+from sbt.metamodels.joint import JointPrediction
 from sbt.metamodels.persistence import load, read_info, save
 from sbt.plugins import Objects
 from sbt.problem.arrays import Points, Vector
@@ -124,11 +124,11 @@ def predict_inputs(
         raise InputError(f"predict needs a campaign with a metamodel, but {folder} has none (add metamodel: {{kind: auto}})")
     space, requirement = study.scenario.space, study.scenario.requirement.in_units_of(history)
     x, ignored = read(space)
-    training = history.finished
+    learner, training = learner.telling(history), history.finished
     if len(training) < 2:
         raise InputError(f"predict needs two runs to learn from, but {folder} has {len(training)}")
     predictor, source = _predictor(folder, learner, history, json.dumps(choice.model_dump(mode="json"), sort_keys=True), device)
-    u, predict, parts = learner.inputs(space.to_unit(x)), in_units(predictor, requirement.critical), []
+    u, predict, parts = learner.inputs(space.to_unit(x)), learner.told(predictor, history), []
     for k in range(0, len(u), _CHUNK):
         p = predicted(predict, u[k : k + _CHUNK])
         each = p.parts if isinstance(p, JointPrediction) else ()
@@ -282,7 +282,8 @@ def _key(learner: Learner, training: History, settings: str) -> str:
     """Return a key of all that decides a fit: the rows, the settings, the seed, the space, the version."""
     space, critical = learner.scenario.space, learner.scenario.requirement.critical
     features, kept = [name for name, _ in space.features], None if learner.traffic is None else learner.traffic.kept
-    decisive = (settings, learner.seed, repr(critical), repr(space.parameters), features, version("sumo-sbt"), kept)
+    fit = settings, learner.target_aware, learner.seed
+    decisive = (*fit, repr(critical), repr(space.parameters), features, version("sumo-sbt"), kept)
     digest = hashlib.blake2b(json.dumps([str(part) for part in decisive]).encode(), digest_size=16)
     digest.update(np.ascontiguousarray(training.x).tobytes())
     digest.update(np.ascontiguousarray(learner.inputs(space.to_unit(training.x))).tobytes())  # features, too

@@ -19,7 +19,6 @@ from sbt.errors import InputError, StoreError
 from sbt.execution.carrying import packed, unpacked
 from sbt.loop.learner import FittedMetamodel
 from sbt.loop.stages import Conclusion, Facts, sentences_of
-from sbt.metamodels.joint import in_units
 from sbt.plugins import OBJECT, Objects
 from sbt.plugins.approval import is_trusted, trust_store
 from sbt.problem.plain import Json
@@ -154,9 +153,10 @@ class Result(Generic[C]):
     @cached_property
     def fitted(self) -> FittedMetamodel | None:
         """The metamodel that learned from all runs but the held-out ones, with its scores on those; None without one."""
-        fitted = self.study.fit(self.history)
-        told = self.scenario.requirement.in_units_of(self.history).critical
-        return None if fitted is None else replace(fitted, predict=in_units(fitted.predict, told))
+        learner, fitted = self.study.learner, self.study.fit(self.history)
+        if learner is None or fitted is None:
+            return None
+        return replace(fitted, predict=learner.told(fitted.predict, self.history))
 
     @property
     def plot(self) -> Plots:

@@ -18,7 +18,6 @@ from sbt.files import write_atomically
 from sbt.loop.learner import FittedMetamodel
 from sbt.loop.running import Finished, check_shard, run_shard, run_stages
 from sbt.loop.stages import Conclusion, Facts, Log, Progress, Shard, sentences_of
-from sbt.metamodels.joint import in_units
 from sbt.plugins import Objects, forget_files
 from sbt.plugins.approval import is_trusted
 from sbt.problem.description import scenario_differences
@@ -244,7 +243,8 @@ def _report(
     log = Log(store.history(), tuple(store.iterations()), ())
     scenario = replace(study.scenario, requirement=study.scenario.requirement.in_units_of(log.history))
     told = sensitivities_in(study, log) if getattr(conclusion, "probability", None) else ()
-    predict = None if fitted is None else in_units(fitted.predict, scenario.requirement.critical)
+    learner = None if fitted is None else study.learner
+    predict = None if fitted is None or learner is None else learner.told(fitted.predict, log.history)
     film = partial(film_runs, study, store.history())
     return write_report(store, scenario, predict, conclusion, folder=target, sensitivity=told, film=film, note=note)
 

@@ -385,7 +385,7 @@ class Study:
 
     def fit(self, history: History) -> FittedMetamodel | None:
         """Return the metamodel fitted to the runs that teach it, and scored; None where there is none."""
-        return None if self.learner is None else self.learner.fit(history)
+        return None if self.learner is None else self.learner.telling(history).fit(history)
 
     @property
     def _simulator(self) -> tuple[Any, ...]:
