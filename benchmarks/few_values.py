@@ -6,6 +6,7 @@
     python benchmarks/few_values.py logarithms [--seeds 12]        # the same problem as y and as log y, 200 runs
     python benchmarks/few_values.py steps [--seeds 4]              # boundaries of counts, rounded metrics and flags, 100 runs
     python benchmarks/few_values.py hits [--seeds 100]             # P(critical) of flags by random runs, few of them critical
+    python benchmarks/few_values.py searched [--seeds 40]          # the same after a falsification of 90 runs, by `predict`
 
 Campaigns with the product's defaults. Combinations: how many falsifications of 100 runs meet a failure, and how many of as many
 random runs do; how many intervals of an estimation cover, and how many gates pass that should not. Estimation: error and half
@@ -252,14 +253,43 @@ def hits(seeds: range) -> Iterator[str]:
         yield f"| {first} to {last} | {len(group)} | {wrong:.1f} | {expected:.1f} | {loss:.3f} | {base:.3f} |"
 
 
+def searched(seeds: range) -> Iterator[str]:
+    yield "| critical runs | flags | expected critical, in % | critical | log loss | of one P wherever |"
+    told: list[tuple[int, list[float]]] = []
+    for seed in seeds:
+        inside, d = region(stream(seed, "flag"))
+        inputs = [sbt.Parameter(f"x{k}", 0.0, 1.0) for k in range(d)]
+
+        def evaluate(values: dict[str, float], _: int, inside: Callable[[Points], Mask] = inside) -> dict[str, float]:
+            return {"flag": float(inside(np.array([list(values.values())]))[0])}
+
+        scenario = sbt.Scenario("region", inputs, sbt.Requirement("flag", low=0.5), evaluate=evaluate)
+        with tempfile.TemporaryDirectory() as folder:
+            found = sbt.run(
+                campaign="falsification", scenario=scenario, budget=90, seed=seed, executor="serial", report=False,
+                store=Path(folder) / "store",
+            )  # fmt: skip
+            at = stream(1, "points").random((4000, d))
+            p, n, critical = found.predict(at)["p_critical"].to_numpy(), int(found.frame["critical"].sum()), inside(at)
+        share = critical.mean()
+        loss = -np.log(np.clip(np.where(critical, p, 1.0 - p), 1e-6, 1.0)).mean()
+        base = -np.where(critical, math.log(share), math.log1p(-share)).mean()
+        told.append((n, [100.0 * p.mean(), 100.0 * share, loss, base]))
+    for first, last in ((0, 0), (1, 2), (3, 12), (13, 199)):
+        group = [row for n, row in told if first <= n <= last]
+        if group:
+            expected, share, loss, base = np.mean(group, axis=0)
+            yield f"| {first} to {last} | {len(group)} | {expected:.1f} | {share:.1f} | {loss:.3f} | {base:.3f} |"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("combinations", "values", "estimation", "logarithms", "steps", "hits"))
+    parser.add_argument("what", choices=("combinations", "values", "estimation", "logarithms", "steps", "hits", "searched"))
     parser.add_argument("--seeds", type=int, default=8)
     given = parser.parse_args()
     tables = {
         "combinations": combinations, "values": values, "estimation": estimation, "logarithms": logarithms, "steps": steps,
-        "hits": hits,
+        "hits": hits, "searched": searched,
     }  # fmt: skip
     rows = tables[given.what](range(given.seeds))
     for k, row in enumerate(rows):
