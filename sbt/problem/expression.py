@@ -158,4 +158,6 @@ def _evaluate(node: ast.expr, values: Mapping[str, Any], text: str) -> Any:
                 raise InputError(f"{name}() in '{text}' takes {count} argument{'s' * (count > 1)}, but got {len(args)}")
             return function(*(_evaluate(arg, values, text) for arg in args))
     allowed = "numbers, inputs, + - * / **, comparisons, == 'choice', and, or, not, " + ", ".join(_FUNCTIONS)
-    raise InputError(f"an expression may use {allowed}, but got '{text}'")
+    equal = isinstance(node, ast.Compare) and any(type(op) in _EQUALITY for op in node.ops)
+    hint = "; that two numbers are equal is written as abs(a - b) < 0.5, or such, with the distance that is meant" if equal else ""
+    raise InputError(f"an expression may use {allowed}, but got '{text}'{hint}")

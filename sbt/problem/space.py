@@ -68,9 +68,7 @@ class ParameterSpace:
             if isinstance(formula, Expression):
                 self.check_formula(formula)
         if self.constraints and self._feasible_share < _MIN_FEASIBLE:
-            way = "; an equality holds hardly anywhere: compute one input from the others, or allow a distance (abs(a - b) < 0.5)"
-            rule = f"constraints must leave at least {_MIN_FEASIBLE:g} of the box, but '{self.rules}' leave less"
-            raise InputError(rule + (way if "==" in self.rules else ""))
+            raise InputError(f"constraints must leave at least {_MIN_FEASIBLE:g} of the box, but '{self.rules}' leave less")
 
     def _check_correlation(self) -> None:
         matrix = np.asarray(self.correlation, dtype=np.float64)
