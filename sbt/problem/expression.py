@@ -159,5 +159,5 @@ def _evaluate(node: ast.expr, values: Mapping[str, Any], text: str) -> Any:
             return function(*(_evaluate(arg, values, text) for arg in args))
     allowed = "numbers, inputs, + - * / **, comparisons, == 'choice', and, or, not, " + ", ".join(_FUNCTIONS)
     equal = isinstance(node, ast.Compare) and any(type(op) in _EQUALITY for op in node.ops)
-    hint = "; that two numbers are equal is written as abs(a - b) < 0.5, or such, with the distance that is meant" if equal else ""
+    hint = "; that two numbers are equal is written as abs(a - b) < 0.5, with the distance that is meant" if equal else ""
     raise InputError(f"an expression may use {allowed}, but got '{text}'{hint}")
