@@ -11,7 +11,7 @@ from sbt.campaigns.counting import NOMINAL, RANDOM
 from sbt.campaigns.failures import FILLING
 from sbt.campaigns.preventable import with_judgements
 from sbt.campaigns.records import CONFIRM
-from sbt.errors import InputError, did_you_mean
+from sbt.errors import InputError, did_you_mean, must_be
 from sbt.files import as_cell, write_atomically
 from sbt.plugins import Objects
 from sbt.store.database import Store
@@ -38,6 +38,7 @@ def export_store(folder: Path, form: str = "csv", *, objects: Objects | None = N
         InputError: an unknown form, a library that is not installed, or (boundary) no metamodel, or no boundary.
         StoreError: the folder holds no campaign.
     """
+    must_be("the format must be text", form, str)
     if form not in FORMS:
         raise InputError(f"the format must be {', '.join(FORMS)}, but got '{form}'{did_you_mean(form, FORMS)}")
     if form == "parquet" and importlib.util.find_spec("pyarrow") is None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,7 +17,7 @@ import numpy as np
 
 from sbt.campaigns.failures import FalsificationConclusion
 from sbt.campaigns.preventable import DRIVERS, describe_judgements
-from sbt.errors import InputError
+from sbt.errors import InputError, must_be
 from sbt.execution.exchange import DRIVER
 from sbt.execution.spec import ScenarioSpec
 from sbt.execution.worker import run_traced
@@ -268,6 +269,7 @@ def _deepest(study: Study, history: History) -> list[int]:
 
 
 def _record(history: History, run: int) -> Record:
+    must_be("a run must be its index", run, Integral)
     rows = np.flatnonzero(history.index == run)
     if len(rows) == 0:
         raise InputError(f"a run must be a finished one of the store, but got {run}")

@@ -148,12 +148,13 @@ def inputs_from(given: Any, space: ParameterSpace) -> tuple[Points, tuple[str, .
 
     Args:
         given: a DataFrame or a mapping with a column (or one value) for each input, named as the input or `x.<input>`, of
-            numbers or of choices as text; or an array (n, d) in the order of the inputs.
+            numbers or of choices as text; a row of one, a list of mappings; or an array (n, d) in their order.
         space: the inputs.
 
     Raises:
         InputError: columns missing, values that are no numbers or outside of the range; the message names row and column.
     """
+    given = _table_of(given)
     if not hasattr(given, "keys"):
         try:
             x = _numbers_of(given, space)
@@ -180,6 +181,19 @@ def inputs_from(given: Any, space: ParameterSpace) -> tuple[Points, tuple[str, .
     if len(sizes) > 1:
         raise InputError(f"columns of inputs must have one length, but got {', '.join(map(str, sorted(sizes)))}")
     return _within(np.column_stack(columns), space), tuple(name for name in head if name not in where)
+
+
+def _table_of(given: Any) -> Any:
+    """Return a row of a DataFrame as a mapping, and a list of mappings as one of columns; all else as it is."""
+    if hasattr(given, "keys") and getattr(given, "ndim", 2) == 1:
+        return dict(given.items())
+    if not isinstance(given, list | tuple) or not given or not all(isinstance(row, Mapping) for row in given):
+        return given
+    names = list(given[0])
+    for k, row in enumerate(given):
+        if set(row) != set(names):
+            raise InputError(f"all rows must have the same inputs, but row 0 has {', '.join(names)}, row {k} {', '.join(row)}")
+    return {name: [row[name] for row in given] for name in names}
 
 
 def _column_of(given: Any, parameter: Parameter) -> Vector:

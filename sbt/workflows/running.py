@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
+from numbers import Integral
 from pathlib import Path
 
 import numpy as np
 
 from sbt.config.load import differences, dump
-from sbt.errors import InputError, PluginError
+from sbt.errors import InputError, PluginError, must_be
 from sbt.execution.code_print import code_print
 from sbt.execution.warming import warm_up
 from sbt.execution.worker import run_traced, versions
@@ -311,6 +312,7 @@ def replay_run(folder: Path, index: int, *, objects: Objects | None = None, exec
 
 def _replayed(folder: Path, index: int, objects: Objects | None, *, execute: bool) -> Replay:
     """Return what `replay_run` does, with all files that were changed of those that this process has read."""
+    must_be("a run must be its index", index, Integral)
     with Store.read(folder) as store:
         study, history = Study.from_store(store, objects=objects), store.history(level=None)
     rows = np.flatnonzero(history.index == index)
