@@ -448,3 +448,20 @@ def test_a_falsification_leaves_coarse_runs_out_that_predict_nothing(tmp_path: P
         assert (told["correlation"] is not None) == correlates
         said = [sentence for sentence in summary.sentences if "Screening did not pay" in sentence]
         assert [("correlates" in sentence) for sentence in said] == [correlates]
+
+
+def test_coarse_runs_without_a_metric_are_no_pairs(tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text(
+        "import sbt, math\n"
+        "def scenario(name, fails):\n"
+        "    return sbt.Scenario(name, inputs=[sbt.Parameter('a', 0, 1)], requirement=sbt.Requirement('y', high=0.0),\n"
+        "        evaluate=lambda values, seed: {'y': math.nan if fails < values['a'] < 0.75 else 1.0 + values['a']})\n"
+        "FINE, COARSE = scenario('fine', 2.0), scenario('coarse', 0.6)\n"
+    )
+    own = {"campaign": "falsification", "scenario": str(tmp_path / "own.py:FINE"), "budget": 30}
+    summary = run(tmp_path / "some", own, fidelity={"scenario": str(tmp_path / "own.py:COARSE"), "cost": 0.2})
+    told = summary.conclusion.to_dict()["fidelity"]
+    with Store.read(tmp_path / "some" / "store") as store:
+        coarse = store.history(level=1)
+    assert 0 < told["pairs"] <= told["coarse"] - told["without"] == int(coarse.ok.sum()) < len(coarse)
+    assert any(f"and {told['without']} of the coarse runs gave no metric" in sentence for sentence in summary.sentences)

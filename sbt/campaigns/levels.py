@@ -199,6 +199,7 @@ class ScreeningTold:
         screened: runs that coarse runs chose among more candidates.
         times: candidates for each run as last judged; 1: screening does not pay.
         gain: critical runs for the same cost over those without, as last judged; None: too little was known.
+        without: coarse runs that gave no metric.
     """
 
     coarse: int
@@ -209,13 +210,16 @@ class ScreeningTold:
     screened: int
     times: int
     gain: float | None = None
+    without: int = 0
 
     def sentence(self) -> str:
         """Return it in words."""
+        none = f", and {self.without:,} of the coarse runs gave no metric" if self.without else ""
         alike = "" if self.correlation is None else f" and correlates with it by {number(self.correlation, 2)}"
         told = (
             f"{plural(self.coarse, 'coarse run')} chose {plural(self.screened, 'run')} of {self.fine:,}: a coarse run costs"
-            f" {number(self.cost, 2)} of a run{alike} ({self.pairs} pairs that none chose). A coarse run counts as no failure"
+            f" {number(self.cost, 2)} of a run{alike} ({plural(self.pairs, 'pair')} that none chose{none})."
+            " A coarse run counts as no failure"
         )
         if self.times > 1 and self.gain is not None:
             promised = f"these pairs promise {number(self.gain, 2)} times as many critical runs for the same cost"
@@ -238,4 +242,6 @@ def screening_told(log: Log, settings: Settings) -> ScreeningTold | None:
     screened = int((log.history.iteration[at] > 0).sum())
     told = (None, 0, screened, 1, None) if last is None else (last.correlation, last.pairs, screened, last.times, last.gain)
     fine = int((log.history.stage != CONFIRM).sum())
-    return ScreeningTold(len(coarse_runs(log)), fine, settings.coarse_cost, *told)
+    coarse = coarse_runs(log)
+    without = int(np.isnan(settings.scenario.requirement.margins(coarse)).sum())
+    return ScreeningTold(len(coarse), fine, settings.coarse_cost, *told, without)

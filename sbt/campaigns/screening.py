@@ -218,11 +218,10 @@ class ScreenStage:
         """Return how many candidates there should be for each run, and why."""
         s = self.search.failure_search.settings
         requirement, history = s.scenario.requirement, log.history
-        coarse, both = _margins(requirement.margins(coarse_runs(log))), twins(log)
-        fine, at = both
-        margin, blind = _margins(requirement.margins(history)), _unselected(log, self.name)
-        known = blind[fine]
-        correlation = rank_correlation(margin[fine[known]], coarse[at[known]])
+        fine, at = both = twins(log)
+        margin, coarse = requirement.margins(history)[fine], requirement.margins(coarse_runs(log))[at]
+        known = _unselected(log, self.name)[fine] & np.isfinite(margin) & np.isfinite(coarse)
+        correlation = rank_correlation(margin[known], coarse[known])
         pairs = int(known.sum())
         if pairs < _FEWEST:
             return ScreenRecord(1, 0.0, correlation, pairs)
