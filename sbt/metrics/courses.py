@@ -22,6 +22,8 @@ _SLACK = 1e-6
 """By how much farther apart than necessary those must be who are passed over (m)."""
 _STRIDE = 5
 """Steps that are passed over at once."""
+_BLOCK = 600
+"""Strides that are looked at together."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,11 +90,11 @@ class Course:
 
 
 _Steps = tuple[float, np.ndarray, np.ndarray, np.ndarray]
-"""Begin of a stride (s), and in it (n,) pairs, in order, instants and steps after these."""
+"""Begin of the earliest stride (s), and (n,) pairs, in order, instants and steps after these."""
 
 
 def near_steps(pairs: Sequence[tuple[Course, Course]], step: float, strides: int) -> Iterator[_Steps]:
-    """Yield, stride by stride, when the circles around two rectangles may touch if both follow their paths at present speeds.
+    """Yield, in blocks, when the circles around two rectangles may touch if both follow their paths at present speeds.
 
     Args:
         pairs: rectangles that are there at the same instants.
@@ -100,46 +102,50 @@ def near_steps(pairs: Sequence[tuple[Course, Course]], step: float, strides: int
         strides: of 5 steps each.
 
     Yields:
-        The begin of a stride (s after the instants), and the (n,) pairs, in their order, instants and steps after these.
+        The begin of a block's earliest stride (s after the instants), none after that of the next block, and the (n,) pairs,
+        in their order, instants and steps after these.
     """
-    pair, instant, reach, pace = _near_instants(pairs, step * _STRIDE * strides)
+    if not pairs:
+        return
+    pair, instant, at, reach, pace = _near_instants(pairs, step * _STRIDE * strides)
     if not len(pair):
         return
     after = step * np.arange(_STRIDE * strides + 1.0)
     paths = _Paths(list(dict.fromkeys(course for both in pairs for course in both)), float(after[-1]))
-    a, b = (_Side(paths, [both[k] for both in pairs], pair, instant, after) for k in (0, 1))
-    every = np.arange(len(pair))
-    coarse = np.abs(b.at(slice(None, None, _STRIDE), every) - a.at(slice(None, None, _STRIDE), every))  # (n, strides + 1)
+    a, b = (_Side(paths, [both[k] for both in pairs], instant, at, after) for k in (0, 1))
+    every, begins = np.arange(len(pair)), _STRIDE * np.arange(strides + 1)
+    coarse = np.abs(b.at(begins, every) - a.at(begins, every))  # (n, strides + 1)
     least = 0.5 * (coarse[:, :-1] + coarse[:, 1:] - (step * _STRIDE * pace)[:, None])  # no distance in the stride is smaller
-    possible = least <= (reach + step * pace + _SLACK)[:, None]
-    for k in range(strides):
-        (rows,) = possible[:, k].nonzero()
-        if len(rows):
-            steps = slice(_STRIDE * k, _STRIDE * (k + 1) + 1)
-            apart = b.at(steps, rows) - a.at(steps, rows)  # (rows, steps + 1)
-            moved = np.abs(apart[:, 1:] - apart[:, :-1])
-            found, which = (np.abs(apart[:, 1:]) <= reach[rows, None] + moved + _SLACK).nonzero()
-            if len(found):
-                yield float(after[_STRIDE * k]), pair[rows[found]], instant[rows[found]], _STRIDE * k + which
+    stride, row = (least <= (reach + step * pace + _SLACK)[:, None]).T.nonzero()
+    for k in range(0, len(row), _BLOCK):
+        rows, first = row[k : k + _BLOCK], begins[stride[k : k + _BLOCK]]
+        steps = first[:, None] + np.arange(_STRIDE + 1)
+        apart = b.at(steps, rows) - a.at(steps, rows)  # (rows, steps + 1)
+        moved = np.abs(apart[:, 1:] - apart[:, :-1])
+        found, which = (np.abs(apart[:, 1:]) <= reach[rows, None] + moved + _SLACK).nonzero()
+        if len(found):
+            order = np.argsort(pair[rows[found]], kind="stable")
+            found, which = found[order], which[order]
+            yield float(after[first[0]]), pair[rows[found]], instant[rows[found]], first[found] + which
 
 
-def _near_instants(pairs: Sequence[tuple[Course, Course]], horizon: float) -> tuple[np.ndarray, np.ndarray, Vector, Vector]:
+def _near_instants(
+    pairs: Sequence[tuple[Course, Course]], horizon: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, Vector, Vector]:
     """Return the instants from which two can touch within the horizon (s).
 
     Returns:
-        (n,) indices of the pairs, instants, radii of the two circles together (m) and speeds together (m/s).
+        (n,) indices of the pairs, instants, these among the instants of all pairs, radii of the two circles together (m) and
+        speeds together (m/s).
     """
-    found = []
-    for k, (one, other) in enumerate(pairs):
-        a, b = one.actor, other.actor
-        reach = 0.5 * (np.hypot(a.length, a.width) + np.hypot(b.length, b.width))
-        pace = np.abs(a.speed) + np.abs(b.speed)
-        (instants,) = (np.hypot(b.x - a.x, b.y - a.y) <= horizon * pace + reach).nonzero()
-        found.append((np.full(len(instants), k), instants, np.full(len(instants), reach), pace[instants]))
-    if not found:
-        return np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(0)
-    pair, instant, reaches, paces = (np.concatenate(column) for column in zip(*found, strict=True))
-    return pair, instant, reaches, paces
+    actors = [(one.actor, other.actor) for one, other in pairs]
+    counts = [len(a.x) for a, _ in actors]
+    x, y, speed = ([np.concatenate([getattr(both[k], name) for both in actors]) for k in (0, 1)] for name in ("x", "y", "speed"))
+    radii = 0.5 * np.hypot(*np.array([[(each.length, each.width) for each in both] for both in actors]).T)  # (2, pairs)
+    reach, pace = np.repeat(radii[0] + radii[1], counts), np.abs(speed[0]) + np.abs(speed[1])
+    (at,) = (np.hypot(x[1] - x[0], y[1] - y[0]) <= horizon * pace + reach).nonzero()
+    pair = np.repeat(np.arange(len(pairs)), counts)[at]
+    return pair, at - np.cumsum([0, *counts])[pair], at, reach[at], pace[at]
 
 
 class _Paths:
@@ -168,25 +174,23 @@ class _Paths:
 
 
 class _Side:
-    """One rectangle of each pair, at n instants, of each of which pair and instant are given, and k times after them."""
+    """One rectangle of each pair, at n instants, which are given also among those of all pairs, and k times after them."""
 
-    def __init__(self, paths: _Paths, courses: list[Course], pair: np.ndarray, instant: np.ndarray, after: np.ndarray) -> None:
-        self._paths, self._after = paths, after
+    def __init__(self, paths: _Paths, courses: list[Course], instant: np.ndarray, at: np.ndarray, after: np.ndarray) -> None:
+        self._paths, self._after, self._at = paths, after, at
         if shared := len(set(courses)) == 1:  # the ego: predicted once an instant
             courses, self._at = courses[:1], instant
-        else:
-            self._at = np.cumsum([0, *(len(course.actor.x) for course in courses)])[pair] + instant
         counts = [len(course.actor.x) for course in courses]
         self._origin = np.repeat([paths.origin[course] for course in courses], counts)
         self._begin = self._origin + np.concatenate([course.begin for course in courses])
         self._speed = np.concatenate([course.actor.speed for course in courses])
-        self._known = self._positions(slice(None), np.arange(len(self._begin))) if shared else None
+        self._known = self._positions(np.arange(len(after)), np.arange(len(self._begin))) if shared else None
 
-    def at(self, steps: slice, rows: np.ndarray) -> np.ndarray:
-        """Return positions (n, k), as complex numbers, at some times after some of the instants."""
+    def at(self, steps: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """Return positions (n, k), as complex numbers, at some times (k,), or (n, k), after some of the instants (n,)."""
         at = self._at[rows]
-        return self._positions(steps, at) if self._known is None else self._known[at, steps]
+        return self._positions(steps, at) if self._known is None else self._known[at[:, None], steps]
 
-    def _positions(self, steps: slice, at: np.ndarray) -> np.ndarray:
+    def _positions(self, steps: np.ndarray, at: np.ndarray) -> np.ndarray:
         distance = self._begin[at, None] + self._speed[at, None] * self._after[steps]
         return self._paths.at(np.maximum(distance, self._origin[at, None]))

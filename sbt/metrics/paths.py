@@ -119,22 +119,25 @@ def _predicted_contacts(
     for begin, pair, rows, steps in near_steps(pairs, _STEP, _STRIDES):
         if only_smallest and begin >= least:
             break
-        found = np.minimum(_contact_times([pairs[k] for k in pair.tolist()], rows, _STEP * steps, _STEP), HORIZON)
+        found = np.minimum(_contact_times(pairs, pair, rows, _STEP * steps, _STEP), HORIZON)
         least = min(least, float(found.min()))
         yield begins[pair] + rows, found
 
 
-def _contact_times(pairs: Sequence[tuple[Course, Course]], rows: np.ndarray, start: np.ndarray, length: float) -> Vector:
+def _contact_times(
+    pairs: Sequence[tuple[Course, Course]], which: np.ndarray, rows: np.ndarray, start: np.ndarray, length: float
+) -> Vector:
     """Return the (n,) times at which the rectangles touch in steps of the prediction (s after the instants), inf where not.
 
     Args:
-        pairs: n pairs, those of the same rectangles one after another.
+        pairs: of rectangles.
+        which: (n,) of the pairs, in their order.
         rows: (n,) instants from which is predicted.
         start: (n,) begin of the steps (s after the instants).
         length: of the steps (s).
     """
     after = np.stack([start, start + length], axis=1)
-    (old_a, a, turn_a), (old_b, b, turn_b) = (_predicted([both[k] for both in pairs], rows, after) for k in (0, 1))
+    (old_a, a, turn_a), (old_b, b, turn_b) = (_predicted([both[k] for both in pairs], which, rows, after) for k in (0, 1))
     dx, dy = old_b[0] - old_a[0], old_b[1] - old_a[1]
     times: Vector = start + length * contact_share(a, b, dx, dy)
     turned = np.fmax(turn_a, turn_b)
@@ -148,8 +151,8 @@ def _contact_times(pairs: Sequence[tuple[Course, Course]], rows: np.ndarray, sta
     if len(inside):
         fine = length / _SPLIT
         begins = (start[inside, None] + fine * np.arange(_SPLIT)).ravel()
-        again = [pairs[k] for k in inside.tolist() for _ in range(_SPLIT)]
-        finer = _contact_times(again, np.repeat(rows[inside], _SPLIT), begins, fine)
+        again, instants = (np.repeat(each[inside], _SPLIT) for each in (which, rows))
+        finer = _contact_times(pairs, again, instants, begins, fine)
         times[inside] = finer.reshape(-1, _SPLIT).min(axis=1)
     return times
 
@@ -158,12 +161,16 @@ _Motion = tuple[tuple[Vector, Vector], Rectangles, Vector]
 """x and y before a step, the rectangles after it, and how far their corners move because they turn (m), (n,) each."""
 
 
-def _predicted(courses: Sequence[Course], rows: np.ndarray, after: np.ndarray) -> _Motion:
-    """Return how n rectangles move between two times (s), `after` (n, 2), after n instants; NaN once one has left the road."""
+def _predicted(courses: Sequence[Course], which: np.ndarray, rows: np.ndarray, after: np.ndarray) -> _Motion:
+    """Return how n rectangles on courses, in their order, move between two times (s), `after` (n, 2), after n instants.
+
+    NaN once one has left the road.
+    """
     parts, sizes = [], []
-    ends = [k + 1 for k in range(len(courses) - 1) if courses[k] is not courses[k + 1]]
-    for begin, end in pairwise([0, *ends, len(courses)]):
-        course = courses[begin]
+    edges = (np.flatnonzero(which[1:] != which[:-1]) + 1).tolist()
+    ends = [k for k in edges if courses[which[k - 1]] is not courses[which[k]]]
+    for begin, end in pairwise([0, *ends, len(which)]):
+        course = courses[which[begin]]
         way, heading = course.way, course.heading
         travelled = course.begin[rows[begin:end], None] + course.actor.speed[rows[begin:end], None] * after[begin:end]
         x, y = np.interp(travelled, way, course.x), np.interp(travelled, way, course.y)
