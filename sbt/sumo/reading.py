@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable, Iterator, Mapping
-from itertools import chain, groupby
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -96,13 +96,15 @@ class Onlooker(Mapping[str, State]):
         self._states, self._dt, self._rows = states, dt, rows
         self._half = [0.0 if a.person else 0.5 * s.length for a, s in zip(actors, states, strict=True)]
         self._index = {state.name: k for k, state in enumerate(states)}
-        self._read: list[tuple[list[tuple[float, float]], list[float], list[float]]] = []
-        self._at = [-1] * len(states)
+        self._places: list[tuple[float, float]] = []  # of all actors in row 0, in row 1, ...
+        self._angles: list[float] = []
+        self._speeds: list[float] = []
+        self._at, self._written = [-1] * len(states), [-1] * len(states)
         self._reach = 2.0 * max(s.length for s in states) + 2.0 * max(self._half)
         self._far = 0.0
 
     def __getitem__(self, name: str) -> State:
-        return self.look(len(self._read) - 1, self._index[name])
+        return self.look(len(self._places) // len(self._states) - 1, self._index[name])
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._index)
@@ -112,44 +114,44 @@ class Onlooker(Mapping[str, State]):
 
     def observe(self, k: int) -> None:
         """Read all actors after step k."""
-        positions: list[tuple[float, float]] = []
-        angles: list[float] = []
-        speeds: list[float] = []
+        places, angles, speeds = self._places, self._angles, self._speeds
         try:
             for (position, angle, speed), names in self._groups:
-                positions.extend(map(position, names))
-                angles.extend(map(angle, names))
-                speeds.extend(map(speed, names))
+                places += map(position, names)
+                angles += map(angle, names)
+                speeds += map(speed, names)
         except Exception as error:  # the class depends on the client: libsumo or traci
             if "is not known" in str(error):
-                raise _left(self._states[self._order[len(positions)]], k * self._dt) from None
+                raise _left(self._states[self._order[len(places) - k * len(self._states)]], k * self._dt) from None
             raise
-        self._read.append((positions, angles, speeds))
 
     def near(self, k: int) -> list[int]:
         """Return which vehicles may have touched the first actor in the step to row k; their states and its are written.
 
         Nobody is looked for while all of them together cannot have come near since they were looked for the last time.
         """
-        positions, _, speeds = self._read[k]
+        m = len(self._states)
+        speeds = self._speeds[k * m : (k + 1) * m]
         own = self._slots[0]
         moved = (speeds[own] + max(speeds)) * self._dt
         self._far -= 2.0 * moved  # twice what it is at a constant speed
         if self._far > 0.0:
             return []
+        positions = self._places[k * m : (k + 1) * m]
         (x, y), reach = positions[own], self._reach + moved
-        left, right = x - reach, x + reach
-        found = [s for s in self._solid if left < positions[s][0] < right and -reach < positions[s][1] - y < reach]
+        left, right, below, above = x - reach, x + reach, y - reach, y + reach
+        found = [s for s in self._solid if left < positions[s][0] < right and below < positions[s][1] < above]
         if not found:
             others = [positions[s] for s in self._solid]
             self._far = min((max(abs(u - x), abs(v - y)) for u, v in others), default=math.inf) - reach
-        if found:
-            found = [self._order[s] for s in found]
-            for j in (0, *found):
-                for row in (k - 1, k) if k else (k,):
-                    state = self.look(row, j)
-                    at = (row * len(self._states) + j) * ROW.size
-                    ROW.pack_into(self._rows, at, state.x, state.y, state.heading, state.speed, state.acceleration)
+            return []
+        found = [self._order[s] for s in found]
+        for j in (0, *found):
+            for row in (k - 1, k) if k and self._written[j] < k - 1 else (k,):
+                state = self.look(row, j)
+                at = (row * m + j) * ROW.size
+                ROW.pack_into(self._rows, at, state.x, state.y, state.heading, state.speed, state.acceleration)
+            self._written[j] = k
         return found
 
     def look(self, k: int, j: int) -> State:
@@ -157,13 +159,13 @@ class Onlooker(Mapping[str, State]):
         state = self._states[j]
         if self._at[j] == k:
             return state
-        positions, angles, speeds = self._read[k]
-        slot, half = self._slots[j], self._half[j]
-        if angles[slot] != state.angle:
-            state.turn(angles[slot])
-        x, y = positions[slot]
-        state.x, state.y, state.speed = x - half * state.cos, y - half * state.sin, speeds[slot]
-        state.acceleration = (speeds[slot] - self._read[k - 1][2][slot]) * (1.0 / self._dt) if k else 0.0
+        m, half = len(self._states), self._half[j]
+        at = k * m + self._slots[j]
+        if self._angles[at] != state.angle:
+            state.turn(self._angles[at])
+        x, y = self._places[at]
+        state.x, state.y, state.speed = x - half * state.cos, y - half * state.sin, self._speeds[at]
+        state.acceleration = (state.speed - self._speeds[at - m]) * (1.0 / self._dt) if k else 0.0
         self._at[j] = k
         return state
 
@@ -173,18 +175,15 @@ class Onlooker(Mapping[str, State]):
         Raises:
             RunError: an actor was not on the road.
         """
-        n, m = len(self._read), len(self._states)
-        flat, slots = chain.from_iterable, self._slots
-        places = np.fromiter(flat(flat(each[0] for each in self._read)), np.float64, 2 * n * m).reshape(n, m, 2)[:, slots]
-        if (gone := np.argwhere(places[:, :, 0] == INVALID_DOUBLE)).size:
+        m = len(self._states)
+        columns = [x for x, _ in self._places], [y for _, y in self._places], self._angles, self._speeds
+        x, y, angles, speeds = (np.fromiter(each, np.float64, len(each)).reshape(-1, m)[:, self._slots] for each in columns)
+        if (gone := np.argwhere(x == INVALID_DOUBLE)).size:
             raise _left(self._states[gone[0, 1]], float(gone[0, 0]) * self._dt)
-        angles, speeds = (
-            np.fromiter(flat(each[c] for each in self._read), np.float64, n * m).reshape(n, m)[:, slots] for c in (1, 2)
-        )
         heading, cos, sin = _directions(angles)
         half = np.array(self._half)
-        states = np.empty((n, m, _COLUMNS))
-        states[:, :, 0], states[:, :, 1] = places[:, :, 0] - half * cos, places[:, :, 1] - half * sin
+        states = np.empty((*x.shape, _COLUMNS))
+        states[:, :, 0], states[:, :, 1] = x - half * cos, y - half * sin
         states[:, :, 2], states[:, :, 3] = heading, speeds
         states[0, :, 4] = 0.0
         states[1:, :, 4] = (speeds[1:] - speeds[:-1]) * (1.0 / self._dt)
