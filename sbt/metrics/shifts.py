@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -103,22 +102,26 @@ def _behind(a: ActorTrace, b: ActorTrace, k: int, *, arcs: bool) -> Callable[[Ve
 
     Circles around them select the instants.
     """
-    whole, n = a, min(len(a.x), len(b.x) - k)
+    n = min(len(a.x), len(b.x) - k)
     old, new = select_instants(b, slice(k - 1, k - 1 + n)), select_instants(b, slice(k, k + n))
-    a = select_instants(a, slice(n))
-    span = max(_longest(c) for c in (a, old, new))
+    own = select_instants(a, slice(n))
+    span = max(_longest(c) for c in (own, old, new))
     reach = 0.5 * (np.hypot(a.length, a.width) + np.hypot(b.length, b.width)) + 3.0 * span
-    rows = np.flatnonzero(np.hypot(new.x - a.x, new.y - a.y) <= reach)
+    rows = np.flatnonzero(np.hypot(new.x - own.x, new.y - own.y) <= reach)
+    before = np.maximum(rows - 1, 0)
+    turn = new.heading[rows] - old.heading[rows]
+    turn = np.arctan2(np.sin(turn), np.cos(turn))
 
     def touches(shifts: Vector) -> np.ndarray:
-        at, share = np.tile(rows, len(shifts)), np.repeat(shifts - (k - 1), len(rows))
-        before = np.maximum(at - 1, 0)
-        here, start = select_instants(a, at), select_instants(a, before)
-        ends, starts = ((select_instants(old, i), select_instants(new, i)) for i in (at, before))
-        end, begin = _between(*ends, share), _between(*starts, share)
-        hits = np.isfinite(contact_share(here, end, begin.x - start.x, begin.y - start.y))
+        share = (shifts - (k - 1))[:, None]
+        both = (old.x, new.x), (old.y, new.y)
+        x, y, u, v = ((start[i] + share * (end[i] - start[i])).ravel() for i in (rows, before) for start, end in both)
+        heading, at = (old.heading[rows] + share * turn).ravel(), np.tile(rows, len(shifts))
+        here = _joined([(a, (own.x[at], own.y[at], own.heading[at]))])
+        first = np.tile(before, len(shifts))
+        hits = np.isfinite(contact_share(here, _joined([(b, (x, y, heading))]), u - own.x[first], v - own.y[first]))
         if arcs:
-            _look_on_arcs(whole, b, at, np.repeat(shifts, len(rows)), hits)
+            _look_on_arcs(a, b, at, np.repeat(shifts, len(rows)), hits)
         return np.asarray(hits.reshape(len(shifts), len(rows)).any(axis=1))
 
     return touches
@@ -250,18 +253,6 @@ def _refined(least: float, parts: int, meet: Callable[[Vector], np.ndarray]) -> 
         met = np.flatnonzero(meet(begin + width * np.arange(1.0, divisions))) if divisions > 1 else np.empty(0)
         least = begin + width * (int(met[0]) + 1 if met.size else divisions)
     return least
-
-
-def _between(actor: ActorTrace, after: ActorTrace, share: float | Vector) -> ActorTrace:
-    """Return an actor between two states of each instant, at a share of the way, or (t,) shares."""
-    turn = after.heading - actor.heading
-    return replace(
-        actor,
-        x=actor.x + share * (after.x - actor.x),
-        y=actor.y + share * (after.y - actor.y),
-        heading=actor.heading + share * np.arctan2(np.sin(turn), np.cos(turn)),
-        parts=tuple(_between(p, q, share) for p, q in zip(actor.parts, after.parts, strict=True)),
-    )
 
 
 def paths_near(a: ActorTrace, b: ActorTrace) -> bool:
