@@ -80,8 +80,10 @@ def _few(loaded: LoadedBenchmark) -> str:
 def _last(results: Results, scenario: str, metamodel: str, acquisition: str, key: str) -> float:
     """Return the mean over the seeds after the last iteration, NaN where it was not reached."""
     wanted = next(c for c in results.cells if c.scenario == scenario)
-    runs, mean, _ = results.curve(scenario, metamodel, acquisition, key)
-    return float(mean[-1]) if len(runs) and runs[-1] == wanted.batch * wanted.iterations else math.nan
+    _, mean, _ = results.curve(scenario, metamodel, acquisition, key)
+    keys = {"scenario": scenario, "metamodel": metamodel, "acquisition": acquisition}
+    runs = [row["runs"] for row in results.rows if keys.items() <= row.items() and math.isfinite(row[key])]
+    return float(mean[-1]) if max(runs, default=0) == wanted.batch * wanted.iterations else math.nan
 
 
 def _table(results: Results) -> str:

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from sbt.benchmark import cell as cell_module
 from sbt.benchmark.cell import PREDICTIONS, is_done, run_cell
+from sbt.benchmark.figures import Results, _curves, _times
 from sbt.benchmark.panels import recall_curve
 from sbt.benchmark.reference import make_reference, reference_rows
 from sbt.benchmark.table import COLUMNS, read_table, rows_of, write_table
@@ -237,6 +238,18 @@ def test_a_benchmark_of_more_iterations_goes_on(analytic):
         for cell in loaded.cells():
             run_cell(cell)
     assert table(grown) == table(whole)
+
+
+def test_figures_are_over_the_runs_that_were_learned_from():
+    """Runs that failed were counted: 60 in the figure where 58 were learned from."""
+    cell = {"scenario": "disc", "metamodel": "gp", "acquisition": "even", "fit_seconds": 1.0, "sampled": 0, "rmse": 0.1}
+    rows = [cell | {"seed": seed, "runs": runs, "learned": runs - failed}
+            for seed, (first, second) in ((1, (0, 2)), (2, (1, 4))) for runs, failed in ((30, first), (60, second))]  # fmt: skip
+    results = Results(tuple(rows), (), ("disc",), ("gp",))
+    for figure in (_curves(results, "even", "rmse", "RMSE", None), _times(results)):
+        ax = figure.axes[0]
+        assert ax.get_xlabel() == "runs learned from"
+        assert ax.get_lines()[0].get_xdata().tolist() == [29.5, 57.0]
 
 
 def test_missing_reference_runs_are_said(analytic):

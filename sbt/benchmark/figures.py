@@ -57,14 +57,12 @@ class Results:
         return cls(rows, cells, scenarios, metamodels)
 
     def curve(self, scenario: str, metamodel: str, acquisition: str, key: str) -> tuple[Vector, Vector, Vector]:
-        """Return (m,) runs, (m,) means and (m,) standard deviations over the seeds of one column."""
+        """Return (m,) runs learned from (mean over the seeds), (m,) means and (m,) standard deviations of one column."""
         wanted = (scenario, metamodel, acquisition)
-        found: dict[float, list[float]] = {}
-        for row in self.rows:
-            if (row["scenario"], row["metamodel"], row["acquisition"]) == wanted and math.isfinite(row[key]):
-                found.setdefault(row["runs"], []).append(row[key])
-        runs = sorted(found)
-        return np.array(runs), np.array([np.mean(found[n]) for n in runs]), np.array([np.std(found[n]) for n in runs])
+        rows = [r for r in self.rows if (r["scenario"], r["metamodel"], r["acquisition"]) == wanted and math.isfinite(r[key])]
+        groups = _of_each_size(rows)
+        found = [[row[key] for row in group] for group in groups]
+        return _learned(groups), np.array([np.mean(each) for each in found]), np.array([np.std(each) for each in found])
 
     def median_cell(self, scenario: str, metamodel: str, acquisition: str) -> Cell | None:
         """Return the finished cell whose last likelihood is closest to the median over the seeds, as the paper does."""
@@ -77,6 +75,23 @@ class Results:
             return None
         middle = np.median([last[c.seed] for c in done])
         return min(done, key=lambda c: abs(last[c.seed] - middle))
+
+
+def _of_each_size(rows: Sequence[Row]) -> list[list[Row]]:
+    """Return the rows of equally many runs together, of the seeds or cells, in the order of how many were learned from."""
+    groups: dict[float, list[Row]] = {}
+    for row in rows:
+        groups.setdefault(row["runs"], []).append(row)
+    return sorted(groups.values(), key=_learned_of)
+
+
+def _learned(groups: Sequence[Sequence[Row]]) -> Vector:
+    """Return (m,) how many runs each of these groups learned from in the mean."""
+    return np.array([_learned_of(group) for group in groups])
+
+
+def _learned_of(group: Sequence[Row]) -> float:
+    return float(np.mean([row["learned"] for row in group]))  # runs that failed are none of them
 
 
 def write_figures(loaded: LoadedBenchmark, table: Path, folder: Path) -> list[Path]:
@@ -241,9 +256,10 @@ def _times(results: Results) -> Figure | None:
     width = 0.8 / max(len(results.metamodels), 1)
     for k, metamodel in enumerate(results.metamodels):
         mine = [row for row in results.rows if row["metamodel"] == metamodel]
-        runs = sorted({row["runs"] for row in mine})
-        median = [np.median([row["fit_seconds"] for row in mine if row["runs"] == n]) for n in runs]
-        left.plot(runs, median, color=COLOURS[k % 8], marker=MARKERS[k % 8], markersize=4, linewidth=1.2, label=metamodel)
+        groups = _of_each_size(mine)
+        median = [np.median([row["fit_seconds"] for row in group]) for group in groups]
+        look: dict[str, Any] = {"color": COLOURS[k % 8], "marker": MARKERS[k % 8], "markersize": 4, "linewidth": 1.2}
+        left.plot(_learned(groups), median, label=metamodel, **look)
         for j, scenario in enumerate(results.scenarios):
             rows = [r for r in mine if (r["scenario"], r["acquisition"]) == (scenario, "boundary") and r["sampled"] > 0]
             if rows:
