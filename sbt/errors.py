@@ -14,8 +14,8 @@ from difflib import get_close_matches
 from pathlib import Path
 
 __all__ = [
-    "RAISED", "InputError", "PluginError", "RunError", "SbtError", "StoreError", "UnwritableError", "command_of", "described",
-    "did_you_mean", "must_be", "must_take", "naming", "place_of", "shown",
+    "RAISED", "FailedRunsError", "InputError", "PluginError", "RunError", "SbtError", "StoreError", "UnwritableError",
+    "command_of", "described", "did_you_mean", "must_be", "must_take", "naming", "place_of", "shown",
 ]  # fmt: skip
 
 
@@ -36,6 +36,10 @@ class InputError(SbtError, ValueError):
 
 class PluginError(InputError):
     """A named scenario, metamodel, acquisition or metric cannot be loaded."""
+
+
+class FailedRunsError(SbtError):
+    """So many runs failed that the others tell nothing; the message says why the first one did (exit code 4)."""
 
 
 class StoreError(SbtError):

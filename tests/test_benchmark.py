@@ -11,7 +11,9 @@ import pytest
 from typer.testing import CliRunner
 
 from sbt.benchmark import cell as cell_module
+from sbt.benchmark import experiment
 from sbt.benchmark.cell import PREDICTIONS, is_done, run_cell
+from sbt.benchmark.failing import cells_that_fail
 from sbt.benchmark.figures import Results, _curves, _times
 from sbt.benchmark.panels import recall_curve
 from sbt.benchmark.reference import make_reference, reference_rows
@@ -19,7 +21,7 @@ from sbt.benchmark.table import COLUMNS, read_table, rows_of, write_table
 from sbt.cli import app
 from sbt.config.benchmark import LoadedBenchmark, load_benchmark
 from sbt.config.source import ConfigError
-from sbt.errors import StoreError
+from sbt.errors import FailedRunsError, InputError, StoreError
 from sbt.plugins import Scope
 from sbt.store.database import Store
 
@@ -250,6 +252,79 @@ def test_figures_are_over_the_runs_that_were_learned_from():
         ax = figure.axes[0]
         assert ax.get_xlabel() == "runs learned from"
         assert ax.get_lines()[0].get_xdata().tolist() == [29.5, 57.0]
+
+
+@pytest.mark.parametrize("more", [["--reference-only"], [], ["--json"]])
+def test_reference_runs_that_all_fail_are_told_once_with_their_reason(analytic, more):
+    """150 of 150 failed, and nobody said why: exit code 0 with --reference-only, else 1 and each cell's line twice."""
+    folder = analytic.parent
+    written(folder, TINY.replace("SCENARIO", "ALL_FAIL"))
+    command = ["benchmark", str(folder / "benchmark.yaml"), "--store", str(folder / "b"), *more]
+    for _ in range(2):
+        done = CliRunner().invoke(app, command)
+        assert done.exit_code == 4
+        assert done.stderr.count("60 of 60 runs failed; run 0: ZeroDivisionError: division by zero (") == 1
+        assert f"remove {folder / 'b' / 'reference' / 'disc'}" in done.stderr
+        assert "metamodel" not in done.output
+    if more == ["--json"]:
+        found = json.loads(done.stdout)
+        assert (found["failed"], found["left_out"], list(found["failing"])) == ({}, 4, ["disc"])
+    elif not more:
+        assert "0 of 4 cells done, 0 failed, 4 left out" in done.stdout
+
+
+def test_more_than_half_of_the_runs_failing_ends_with_4(analytic):
+    """With enough that went well for the cells to be done, and again when there is nothing left to do."""
+    folder = analytic.parent
+    analytic.write_text(analytic.read_text() + """
+
+def most_fail(values, seed):
+    if values["a"] < 0.7:
+        raise RunError("invalid", "a < 0.7 cannot be realised")
+    return disc(values, seed)
+
+
+MOST_FAIL = scenario(most_fail)
+""")
+    text = TINY.replace("SCENARIO", "MOST_FAIL").replace("  - {kind: gp}\n", "").replace("iterations: 3", "iterations: 1")
+    written(folder, text)
+    loaded, listener = written(folder, text), experiment.Listener(lambda line: None, lambda state: None)
+    for _ in range(2):
+        found = experiment.run_benchmark(loaded, listener, figures=False)
+        assert (found["done"], found["failed"], found["left_out"]) == (2, {}, 0)
+        assert "at most half of the reference runs may fail, but" in found["failing"]["disc"]
+    told = cells_that_fail(list(loaded.cells()))
+    assert "runs of its cells may fail, but 18 of 24 did; disc / et / even / seed 4: 9 of 12 runs failed; run 1: a < 0.7" in told
+    command = ["benchmark", str(folder / "benchmark.yaml"), "--store", str(folder / "b"), "--reference-only"]
+    done = CliRunner().invoke(app, command)
+    assert done.exit_code == 4
+    assert done.stderr.count("a < 0.7 cannot be realised") == 1
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [(InputError("is wrong"), 2), (FailedRunsError("is wrong"), 4), (StoreError("is wrong"), 1), (KeyError("is wrong"), 1)],
+)
+def test_a_cell_that_fails_is_told_once_and_by_its_own_exit_code(analytic, monkeypatch, error, code):
+    folder = analytic.parent
+    written(folder)
+
+    def broken(cell):
+        raise error
+
+    monkeypatch.setattr(experiment, "run_cell", broken)
+    for more in ([], ["--quiet"]):
+        done = CliRunner().invoke(app, ["benchmark", str(folder / "benchmark.yaml"), "--store", str(folder / "b"), *more])
+        assert done.exit_code == code
+        assert done.stderr.count("disc / et / even / seed 4") == 1
+        assert "internal error" not in done.output
+
+
+def test_a_cell_without_runs_that_went_well_says_why(analytic):
+    loaded = written(analytic.parent, TINY.replace("SCENARIO", "ALL_FAIL"))
+    make_reference(next(loaded.references())[1], 1)
+    with pytest.raises(FailedRunsError, match=r"^a metamodel needs two .* but 36 of 36 runs failed; run 0: ZeroDivisionError"):
+        run_cell(next(loaded.cells()))
 
 
 def test_missing_reference_runs_are_said(analytic):

@@ -15,9 +15,10 @@ import numpy as np
 from sbt.benchmark.reference import reference_rows
 from sbt.benchmark.stores import SIMULATED, changes_in, open_store
 from sbt.campaigns.settings import Acquisition, PlainConclusion
+from sbt.campaigns.wording import failed_words
 from sbt.config.assemble import assemble
 from sbt.config.benchmark import Cell
-from sbt.errors import SbtError
+from sbt.errors import FailedRunsError
 from sbt.execution.protocol import SerialExecutor
 from sbt.files import write_atomically
 from sbt.loop.learner import FittedMetamodel, Learner
@@ -78,6 +79,7 @@ def run_cell(cell: Cell, progress: Callable[[Progress], None] | None = None) -> 
 
     Raises:
         InputError: the reference runs are missing, or the store was made with other settings.
+        FailedRunsError: fewer than two of its runs went well.
         StoreError: it cannot be written.
     """
     parts, n = assemble(cell.loaded), cell.reference_runs
@@ -92,7 +94,8 @@ def run_cell(cell: Cell, progress: Callable[[Progress], None] | None = None) -> 
     def conclude(log: Log) -> tuple[PlainConclusion, FittedMetamodel]:
         fitted = learner.fit(log.history)
         if fitted is None:
-            raise SbtError(f"{cell.name}: a metamodel needs two runs that went well, but got fewer")
+            why = failed_words(log.history) or f"there are {len(log.history)}"
+            raise FailedRunsError(f"a metamodel needs two runs that went well, but {why}")
         _write_predictions(cell.folder, learner, fitted, log.history)
         return PlainConclusion({}), fitted
 

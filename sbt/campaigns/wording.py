@@ -15,8 +15,8 @@ from sbt.problem.requirement import Requirement
 from sbt.store.history import History
 
 __all__ = [
-    "NOTHING", "digits_of", "estimating", "input_value", "input_widths", "measured", "mixture_shares", "narrow_digits",
-    "number", "percent", "plural", "requirement_words", "unit_of", "widening", "written_unit",
+    "NOTHING", "digits_of", "estimating", "failed_words", "input_value", "input_widths", "measured", "mixture_shares",
+    "narrow_digits", "number", "percent", "plural", "requirement_words", "unit_of", "widening", "written_unit",
 ]  # fmt: skip
 
 _NIL = 1e-30  # a rounding error of what is zero
@@ -87,6 +87,15 @@ def narrow_digits(inputs: Mapping[str, Any], widths: Mapping[str, float]) -> dic
     finite = {name: value for name, value in numbers.items() if math.isfinite(value)}
     digits = {name: digits_of(value, widths.get(name, math.inf)) for name, value in finite.items()}
     return {name: n for name, n in digits.items() if n > digits_of(finite[name])}
+
+
+def failed_words(history: History) -> str:
+    """Return how many of these runs failed, and why the first of them did; "" where none did."""
+    failed = np.flatnonzero(~history.ok)
+    if len(failed) == 0:
+        return ""
+    first = history.record(int(failed[0]))
+    return f"{len(failed):,} of {plural(len(history), 'run')} failed; run {first.index}: {first.reason}"
 
 
 def percent(value: float) -> str:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from sbt.cli.console import Exit, ProgressDisplay, clean_stdout, fail, next_command, print_json, resumable
+from sbt.errors import FailedRunsError, InputError
 
 __all__ = ["benchmark"]
 
@@ -39,7 +41,14 @@ def benchmark(
         loaded = load_benchmark(config, overrides)
         from sbt.benchmark.experiment import Listener, run_benchmark
 
-        listener = Listener(lambda line: None if silent else print(line, file=sys.stderr, flush=True), show)
+        told: list[str] = []
+
+        def tell(line: str) -> None:
+            if not silent:
+                told.append(line)
+                print(line, file=sys.stderr, flush=True)
+
+        listener = Listener(tell, show)
         simulate = not (reference_only or figures_only)
         work.folder = Path(loaded.config.store)
         result = run_benchmark(loaded, listener, reference=not figures_only, cells=simulate, figures=not reference_only)
@@ -48,9 +57,21 @@ def benchmark(
     else:
         if reference_only:
             print("\n".join(f"reference runs: {folder}" for folder in result["references"]))
-        print(f"{result['done']} of {result['cells']} cells done, {len(result['failed'])} failed")
+        left_out = f", {result['left_out']} left out" if result["left_out"] else ""
+        print(f"{result['done']} of {result['cells']} cells done, {len(result['failed'])} failed{left_out}")
         print(f"table: {result['table']}, {len(result['figures'])} figures" if result["table"] else f"store: {result['store']}")
-        if result["done"] < result["cells"] and not figures_only:
+        if result["done"] < result["cells"] and not (figures_only or result["failing"]):
             next_command("sumo-sbt", "benchmark", config)
-    if result["failed"]:
-        raise fail("\n".join(f"{name}: {reason}" for name, reason in result["failed"].items()), Exit.INTERNAL)
+    if result["failed"] or result["failing"]:
+        lines = [f"{name}: {why}" for name, why in (*result["failing"].items(), *result["failed"].items())]
+        untold = "\n".join(line for line in lines if line not in told)
+        code = _verdict(result)
+        raise fail(untold, code) if untold else typer.Exit(int(code))
+
+
+def _verdict(result: Mapping[str, Any]) -> Exit:
+    """Return the exit code of a benchmark in which cells or too many runs failed."""
+    errors = result["failed"].values()
+    if result["failing"] or any(isinstance(error, FailedRunsError) for error in errors):
+        return Exit.FAILED_RUNS
+    return Exit.INPUT if all(isinstance(error, InputError) for error in errors) else Exit.INTERNAL

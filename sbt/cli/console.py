@@ -21,7 +21,7 @@ import typer
 
 from sbt import interruption
 from sbt.cli.progress import ProgressDisplay
-from sbt.errors import InputError, SbtError, command_of
+from sbt.errors import FailedRunsError, InputError, SbtError, command_of
 from sbt.execution.streams import SteadyStream, UnwrittenError, open_missing
 
 __all__ = [
@@ -78,6 +78,8 @@ def _verdict(error: BaseException) -> tuple[str, Exit]:
         return "interrupted", Exit.INTERRUPTED
     if isinstance(error, InputError):
         return str(error), Exit.INPUT
+    if isinstance(error, FailedRunsError):
+        return str(error), Exit.FAILED_RUNS
     if isinstance(error, SbtError):
         return str(error), Exit.INTERNAL
     if isinstance(error, UnwrittenError):

@@ -7,7 +7,7 @@ from concurrent.futures import as_completed
 from typing import Any, ParamSpec, TypeVar
 
 from sbt import interruption
-from sbt.errors import SbtError, described
+from sbt.errors import FailedRunsError, InputError, SbtError, described
 from sbt.execution.pool import broken, close_pool, how_ended, open_pool
 from sbt.processes import scratch
 
@@ -22,8 +22,8 @@ class DiedError(SbtError):
     """A worker process died."""
 
 
-def each(function: Callable[[T], None], items: Sequence[T], workers: int) -> Iterator[tuple[T, str | None]]:
-    """Call a function with every item, and yield each as it is done, with the reason where it raised.
+def each(function: Callable[[T], None], items: Sequence[T], workers: int) -> Iterator[tuple[T, SbtError | None]]:
+    """Call a function with every item, and yield each as it is done, with the error where it raised one.
 
     Args:
         function: importable in another process; its results are what it writes.
@@ -42,7 +42,7 @@ def each(function: Callable[[T], None], items: Sequence[T], workers: int) -> Ite
                 try:
                     yield futures[future], future.result()
                 except broken():
-                    yield futures[future], "a worker process died; run again to go on"
+                    yield futures[future], DiedError("a worker process died; run again to go on")
         finally:
             close_pool(pool)
 
@@ -75,11 +75,12 @@ def elsewhere(seconds: float, function: Callable[P, R], *args: P.args, **kwargs:
     raise DiedError(f"the worker process died{how_ended(next(iter(processes), None))}")
 
 
-def _tried(function: Callable[[T], None], item: T) -> str | None:
+def _tried(function: Callable[[T], None], item: T) -> SbtError | None:
     try:
         function(item)
     except BaseException as error:
         if interruption.is_interruption(error):
             raise KeyboardInterrupt from None
-        return str(error) if isinstance(error, SbtError) else described(error)
+        kind = next((kind for kind in (InputError, FailedRunsError, SbtError) if isinstance(error, kind)), None)
+        return SbtError(described(error)) if kind is None else kind(str(error))  # of plain text: it comes from another process
     return None

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from sbt.campaigns.estimation import EstimationConclusion
 from sbt.campaigns.preventable import with_judgements
-from sbt.campaigns.wording import plural
+from sbt.campaigns.wording import failed_words, plural
 from sbt.errors import InputError, StoreError
 from sbt.execution.carrying import packed, unpacked
 from sbt.loop.learner import FittedMetamodel
@@ -297,11 +297,7 @@ class Result(Generic[C]):
 
     def _failures(self) -> list[str]:
         """Return how many runs gave no metrics, and why the first did not."""
-        failed = [int(i) for i in (~self.history.ok).nonzero()[0]]
-        if not failed:
-            return []
-        first = self.history.record(failed[0])
-        return [f"{len(failed):,} of {plural(len(self.history), 'run')} failed; run {first.index}: {first.reason}"]
+        return [words] if (words := failed_words(self.history)) else []
 
     def __repr__(self) -> str:
         """Return campaign, scenario and counts."""
