@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from test_explorer import film_of, films_of
 from test_report import fill, predict, scenario_of
 
 from sbt.report.html import write_report
-from sbt.report.versus import write_versus
+from sbt.report.versus import Question, write_versus
 
 _AXE = importlib.util.find_spec("axe_core_python")
 pytestmark = [
@@ -67,12 +68,15 @@ def test_the_report_has_no_serious_fault(browser: Browser, tmp_path: Path) -> No
 def test_the_comparison_has_no_serious_fault(browser: Browser, tmp_path: Path) -> None:
     """With two films in step."""
     pairs = [("fixed", film_of(1), film_of(2))]
-    side = {"probability": 0.1, "low": 0.05, "high": 0.2, "failed": 0}
+    side = {"probability": 0.1, "low": 0.05, "high": 0.2, "failed": 0, "critical": 1}
     result = {
-        "fixed": [{"run": 1, "inputs": {"d_v": 3.0}, "seed": 7}], "new": [], "pairs": 10, "still": 0,
+        "fixed": [{"run": 1, "inputs": {"d_v": 3.0}, "seed": 7, "before": {"pet": 0.2}, "after": {"pet": math.inf}}],
+        "new": [], "pairs": 10, "still": 0,
         "before": side, "after": side, "difference": -0.1, "low": -0.2, "high": 0.0, "confidence": 0.95, "verdict": "fell",
     }  # fmt: skip
-    page = write_versus(tmp_path, "Two egos", result, pairs, units={"d_v": "m/s"}, commands="sumo-sbt replay DIR 1")
+    question = Question("pet ≤ 1 s", {"pet": "s"}, ("a.yaml", "that of cut_in"), ("b.yaml", "acc_aeb, reaction_time: 1.5"))
+    command = "sumo-sbt replay DIR 1"
+    page = write_versus(tmp_path, "Two egos", result, pairs, question=question, units={"d_v": "m/s"}, commands=command)
     browser.open(f"file://{page}")
     browser.wait("window.versus && window.Plotly && document.querySelector('#pairs .main-svg')")
     assert faults(browser) == []

@@ -239,6 +239,49 @@ def test_different_questions_are_refused(configured, tmp_path):
     assert "one requirement" in done.output + str(done.stderr)
 
 
+def test_the_page_says_what_was_asked_of_which_egos(configured, tmp_path):
+    """It had the intervals only as lines, on an axis with one tick, and neither the requirement nor the metrics of a pair."""
+    (tmp_path / "analytic.py").write_text((tmp_path / "analytic.py").read_text() + """
+
+
+def better(values, seed):
+    return {"y": float("inf") if values["a"] < 0.5 else disc(values, seed)["y"], "noise": 0.0}
+
+
+BETTER = scenario(better)
+""")
+    a, b = configured("a", budget=200), configured("b", "BETTER")
+    done = CliRunner().invoke(app, ["compare-ego", str(a), str(b), "--store", str(tmp_path / "both"), "--json"])
+    assert done.exit_code == 0, done.output
+    found = json.loads(done.stdout)
+    assert all(pair["before"]["y"] <= 0.0 and pair["infinite"] == {"after.y": "inf"} for pair in found["fixed"])
+    page = Path(found["page"]).read_text(encoding="utf-8").replace("\N{NO-BREAK SPACE}", " ")
+    assert "A run is critical if y ≤ 0." in page
+    for name, path, ego in (("before", "a.yaml", "analytic.py:SCENARIO"), ("after", "b.yaml", "analytic.py:BETTER")):
+        s = found[name]
+        cells = [name, f"{100 * s['probability']:.3g} %", f"{100 * s['low']:.3g} to {100 * s['high']:.3g} %",
+                 f"{s['critical']} of 200", "0", f"that of the scenario {ego}", path]  # fmt: skip
+        assert "".join(f"<td>{cell}</td>" for cell in cells) in page
+    assert f"<td>{100 * found['low']:+.3g} to {100 * found['high']:+.3g} points</td>" in page
+    assert "<th>run</th><th>y before</th><th>y after</th><th>a</th>" in page
+    first = found["fixed"][0]
+    assert f"<td>{first['run']}</td><td>{first['before']['y']:.4g}</td><td>inf</td>" in page
+    svg = page[page.index('<svg class="intervals"') : page.index("</svg>", page.index('<svg class="intervals"'))]
+    assert len(re.findall(r'y="138" text-anchor="middle">-?[\d.]+</text>', svg)) >= 3
+
+
+@pytest.mark.parametrize("ends", [(0.0, 1.0), (-0.73, 0.75), (0.0, 1e-4), (-0.001, 0.002), (0.0, 0.3), (-1.0, 1.0)])
+def test_ticks_of_the_intervals_are_few_and_round(ends):
+    from sbt.report.versus import _round_values
+
+    low, high = ends
+    values = np.array(_round_values(low, high))
+    assert 2 <= len(values) <= 7
+    assert low - 1e-9 <= values.min() <= values.max() <= high + 1e-9
+    assert np.abs(values).min() < 1e-12
+    assert all(len(f"{100 * value:.6g}") <= 6 for value in values)
+
+
 @pytest.mark.sumo
 def test_egos_of_sumo(tmp_path):
     def config(name, ego):

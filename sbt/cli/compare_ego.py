@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from sbt.cli.console import Exit, ProgressDisplay, clean_stdout, fail, next_command, print_json, resumable
+from sbt.cli.console import Exit, ProgressDisplay, clean_stdout, fail, infinite, next_command, print_json, resumable
 
 __all__ = ["compare_ego"]
 
@@ -35,7 +35,7 @@ def compare_ego(
         work.folder = folder
         result = (compare_rare if rare else compare_egos)(first, second, store=folder, runs=runs, progress=show)
     if as_json:
-        print_json(result)
+        print_json(result if rare else {**result, **{kind: [_whole(pair) for pair in result[kind]] for kind in ("fixed", "new")}})
     else:
         print("\n".join(_rare_lines(result) if rare else _lines(result)))
         if not rare and (result["new"] or result["fixed"]):
@@ -60,6 +60,12 @@ def _lines(result: Mapping[str, Any]) -> list[str]:
     if "warm_ups" in result:
         lines.append(f"  conditional on the traffic of {result['warm_ups']} warm-ups; runs that share one count for fewer")
     return [*lines, f"page: {result['page']}"]
+
+
+def _whole(pair: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a pair of runs for JSON, with the ends of the scale at which its metrics are."""
+    sides = {f"{side}.{name}": value for side in ("before", "after") for name, value in pair[side].items()}
+    return {**pair, **infinite(sides)}
 
 
 def _rare_lines(result: Mapping[str, Any]) -> list[str]:

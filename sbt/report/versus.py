@@ -4,26 +4,45 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sbt.campaigns.wording import input_value, measured, percent, plural, written_unit
+from sbt.campaigns.wording import input_value, measured, number, percent, plural, written_unit
 from sbt.files import write_atomically
 from sbt.problem.plain import Json
 from sbt.report.explorer import library, packed, render, scripts, styles
 from sbt.report.reel import Film, Reels
 
-__all__ = ["PAGE", "write_versus"]
+__all__ = ["PAGE", "Question", "write_versus"]
 
 PAGE = "compare.html"
 _LISTED = 200
 _VERDICTS = {"fell": "fell", "rose": "rose", "undecided": "may have fallen or risen: the runs do not decide"}
 _LEFT, _RIGHT = 110.0, 540.0
+_TICKS = 6
+"""Most ticks of the axis."""
+
+
+@dataclass(frozen=True)
+class Question:
+    """What is compared.
+
+    Args:
+        critical: when a run is critical, in words.
+        metrics: unit of each metric of the requirement, by name.
+        before, after: file of the configuration, and its ego in words.
+    """
+
+    critical: str
+    metrics: Mapping[str, str]
+    before: tuple[str, str]
+    after: tuple[str, str]
 
 
 def write_versus(
-    folder: Path, title: str, result: Mapping[str, Any], films: Sequence[tuple[str, Film, Film]], *, units: Mapping[str, str],
-    commands: str, note: str = "",
+    folder: Path, title: str, result: Mapping[str, Any], films: Sequence[tuple[str, Film, Film]], *, question: Question,
+    units: Mapping[str, str], commands: str, note: str = "",
 ) -> Path:  # fmt: skip
     """Write the page and return its path.
 
@@ -32,6 +51,7 @@ def write_versus(
         title: of the page.
         result: of `sbt.workflows.paired.compare_egos`.
         films: of the same draws: "fixed" or "new", the film with the ego before, and after.
+        question: what was asked of which egos.
         units: of inputs, by name.
         commands: how a pair is opened.
         note: why films are missing.
@@ -49,9 +69,10 @@ def write_versus(
     ]  # fmt: skip
     page = render("versus.html", {
         "title": title, "lead": _lead(result), "sentences": _sentences(result), **_bars(result), "note": note,
+        "critical": question.critical, "egos": _egos(result, question),
         "commands": commands,
         "tables": [
-            _table(f"{kind.capitalize()} failures", result[kind], units, widths) for kind in ("fixed", "new")
+            _table(f"{kind.capitalize()} failures", result[kind], units, widths, question) for kind in ("fixed", "new")
         ],
         "explorer": {
             "data": packed({"pairs": pairs, "lanes": reels.lanes}), "library": library() if pairs else "",
@@ -65,26 +86,52 @@ def write_versus(
 def _lead(result: Mapping[str, Any]) -> str:
     before, after = (result[name]["probability"] for name in ("before", "after"))
     said = f"The probability of a critical run {_VERDICTS[result['verdict']]}: {percent(before)} before, {percent(after)} after"
-    return f"{said}; change {100 * result['difference']:+.3g} percentage points ({_interval(result, result['confidence'])})."
+    return f"{said}; change {_points(result['difference'])} percentage points ({_interval(result, result['confidence'])})."
+
+
+def _egos(result: Mapping[str, Any], question: Question) -> Json:
+    """Return the table of both egos and of the change: shares of critical runs with intervals."""
+    interval = f"{percent(result['confidence'])} interval"
+    columns = ["", "P(critical)", interval, "critical runs", "failed runs", "ego", "configuration"]
+    rows = []
+    for name, (path, ego) in (("before", question.before), ("after", question.after)):
+        s = result[name]
+        ends = f"{100 * s['low']:.3g} to {percent(s['high'])}"
+        critical = f"{s['critical']:,} of {result['pairs']:,}"
+        rows.append([name, percent(s["probability"]), ends, critical, f"{s['failed']:,}", ego, path])
+    change = f"{_points(result['low'])} to {_points(result['high'])} points"
+    more = result["after"]["critical"] - result["before"]["critical"]
+    rows.append(["change", f"{_points(result['difference'])} points", change, f"{more:+,}" if more else "0", "", "", ""])
+    return {"columns": columns, "rows": rows}
 
 
 def _interval(result: Mapping[str, Any], confidence: float) -> str:
-    return f"{percent(confidence)} interval {100 * result['low']:+.3g} to {100 * result['high']:+.3g}"
+    return f"{percent(confidence)} interval {_points(result['low'])} to {_points(result['high'])}"
+
+
+def _points(value: float) -> str:
+    """Return a difference of probabilities in percentage points; 0 has no sign."""
+    return f"{100 * value:+.3g}" if value else "0"
 
 
 def _sentences(result: Mapping[str, Any]) -> list[str]:
-    failed, fixed = result["before"]["failed"] + result["after"]["failed"], plural(len(result["fixed"]), "failure")
+    failed, fixed, new = result["before"]["failed"] + result["after"]["failed"], len(result["fixed"]), len(result["new"])
+    still = result["still"]
     lost = f" {failed:,} failed runs count as whatever is worse for the end in question." if failed else ""
     of, conditional = "exact and paired", []
     if "warm_ups" in result:
         of = "paired, and that of fewer pairs, since some share a warm-up"
         conditional = [f"The comparison is conditional on the traffic of {plural(result['warm_ups'], 'warm-up')}."]
     return [
-        f"{fixed} {'was' if len(result['fixed']) == 1 else 'were'} fixed, {len(result['new']):,} are new,"
-        f" {result['still']:,} runs are critical with both, of {result['pairs']:,} pairs of runs with common draws and seeds.",
+        f"{plural(fixed, 'failure')} {_be(fixed, 'was', 'were')} fixed, {new:,} {_be(new)} new, {plural(still, 'run')}"
+        f" {_be(still)} critical with both, of {plural(result['pairs'], 'pair')} of runs with common draws and seeds.",
         f"The interval of the change is {of}: only runs with different verdicts tell the egos apart.{lost}"
         " They also decide whether P rose or fell (McNemar's test).", *conditional,
     ]
+
+
+def _be(n: int, one: str = "is", several: str = "are") -> str:
+    return one if n == 1 else several
 
 
 def _bars(result: Mapping[str, Any]) -> Json:
@@ -99,10 +146,22 @@ def _bars(result: Mapping[str, Any]) -> Json:
 
     bars = [
         {"name": name, "y": 22 + 38 * k, "low": place(each["low"]), "high": place(each["high"]), "at": place(each["probability"]),
-         "text": f"{100 * each['probability']:+.3g} points" if name == "change" else f"{100 * each['probability']:.3g} %"}
+         "text": f"{_points(each['probability'])} points" if name == "change" else f"{100 * each['probability']:.3g} %"}
         for k, (name, each) in enumerate(given)
     ]  # fmt: skip
-    return {"bars": bars, "zero": place(0.0)}
+    ticks = [{"at": place(value), "text": f"{100 * value:.6g}"} for value in _round_values(low, low + span)]
+    return {"bars": bars, "zero": place(0.0), "ticks": ticks}
+
+
+def _round_values(low: float, high: float) -> list[float]:
+    """Return at most six round numbers between the two, evenly spaced, with 0 where it lies between.
+
+    >>> [round(100 * value) for value in _round_values(-0.73, 0.74)]
+    [-50, -25, 0, 25, 50]
+    """
+    power = 10.0 ** math.floor(math.log10((high - low) / _TICKS))
+    step = next(step for factor in (1, 2, 2.5, 5, 10, 20) if (high - low) / (step := factor * power) < _TICKS)
+    return [k * step for k in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)]
 
 
 def _widths(inputs: Sequence[Mapping[str, Any]]) -> dict[str, float]:
@@ -117,13 +176,24 @@ def _inputs(inputs: Mapping[str, Any], units: Mapping[str, str], widths: Mapping
     return ", ".join(measured(name, value, units.get(name, "")) for name, value in told.items())
 
 
-def _table(title: str, found: Sequence[Mapping[str, Any]], units: Mapping[str, str], widths: Mapping[str, float]) -> Json:
+def _table(
+    title: str, found: Sequence[Mapping[str, Any]], units: Mapping[str, str], widths: Mapping[str, float], question: Question
+) -> Json:
     names = list(found[0]["inputs"]) if found else []
+    sides = [(metric, side) for metric in question.metrics for side in ("before", "after")]
     return {
         "title": title, "count": f"{len(found):,}" + (f", the first {_LISTED}" if len(found) > _LISTED else ""),
-        "columns": ["run", *(f"{n} ({written_unit(units[n])})" if units.get(n) else n for n in names), "seed"],
+        "columns": [
+            "run", *(_headed(f"{m} {side}", question.metrics[m]) for m, side in sides),
+            *(_headed(n, units.get(n, "")) for n in names), "seed",
+        ],
         "rows": [
-            [r["run"], *(input_value(r["inputs"][n], widths.get(n, math.inf), 5) for n in names), r["seed"]]
+            [r["run"], *(number(r[side][m]) for m, side in sides),
+             *(input_value(r["inputs"][n], widths.get(n, math.inf), 5) for n in names), r["seed"]]
             for r in found[:_LISTED]
         ],
     }  # fmt: skip
+
+
+def _headed(name: str, unit: str) -> str:
+    return f"{name} ({written_unit(unit)})" if unit else name

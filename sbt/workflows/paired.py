@@ -20,13 +20,13 @@ import numpy as np
 from sbt.campaigns.clustering import clustered_interval, likelier
 from sbt.campaigns.counting import random_draws
 from sbt.campaigns.gate import CONDITION
-from sbt.campaigns.wording import number
+from sbt.campaigns.wording import number, requirement_words
 from sbt.config.load import load
 from sbt.errors import InputError, command_of
 from sbt.loop.stages import Progress
 from sbt.problem.arrays import Mask, Vector
 from sbt.problem.plain import Json, unit_of
-from sbt.report.versus import write_versus
+from sbt.report.versus import Question, write_versus
 from sbt.store.database import DATABASE, Store
 from sbt.store.history import History
 from sbt.workflows.filming import film_runs
@@ -129,7 +129,8 @@ def compare_egos(
 
     Returns:
         Probabilities with intervals, their difference with its interval, a verdict (`fell`, `rose`,
-        `undecided`), the runs that were fixed and that are new, with inputs and seed, and the path of a page with their films.
+        `undecided`), the runs that were fixed and that are new, with inputs, seed and metrics before and after, and the path of a
+        page with their films.
 
     Raises:
         InputError: the configurations ask for different inputs, distributions or requirements.
@@ -147,7 +148,7 @@ def compare_egos(
         run_study(study, progress=progress, report=False)
     histories = [_history(store / name) for name in ("a", "b")]
     result = _result(histories[0], histories[1], one.scenario.requirement)
-    return {**result, "page": str(_page(store, (one, other), histories, result, f"{first.stem} and {second.stem}"))}
+    return {**result, "page": str(_page(store, (one, other), histories, result, (first, second)))}
 
 
 def _first_batch(folder: Path, budget: int) -> int:
@@ -158,7 +159,7 @@ def _first_batch(folder: Path, budget: int) -> int:
     return min(budget, _BATCH)
 
 
-def _page(store: Path, studies: Sequence[Study], histories: Sequence[History], result: Json, names: str) -> Path:
+def _page(store: Path, studies: Sequence[Study], histories: Sequence[History], result: Json, paths: tuple[Path, Path]) -> Path:
     """Write the page of a comparison, with the films of some pairs, and return its path."""
     scenario, kinds = studies[0].scenario, {f["run"]: kind for kind in ("fixed", "new") for f in result[kind][:_FILMED]}
     rows = {int(index): row for row, index in enumerate(histories[0].index)}
@@ -173,9 +174,30 @@ def _page(store: Path, studies: Sequence[Study], histories: Sequence[History], r
         notes.append(note)
     both = [(kinds[run], films[0][run], films[1][run]) for run in chosen if run in films[0] and run in films[1]]
     commands = "\n".join(command_of("sumo-sbt", "replay", store / name) + " RUN --gif RUN.gif" for name in ("a", "b"))
-    title = f"{scenario.name}: {names} on the same draws"
+    title = f"{scenario.name}: {paths[0].stem} and {paths[1].stem} on the same draws"
     units, note = {p.name: p.unit for p in scenario.space.parameters}, " ".join(dict.fromkeys(filter(None, notes)))
-    return write_versus(store, title, result, both, units=units, commands=commands, note=note)
+    question = _question(studies, paths)
+    return write_versus(store, title, result, both, question=question, units=units, commands=commands, note=note)
+
+
+def _question(studies: Sequence[Study], paths: tuple[Path, Path]) -> Question:
+    """Return what is compared: when a run is critical, and the egos as they are configured."""
+    scenario = studies[0].scenario
+    requirement, meanings = scenario.requirement, {m.name: m.description for m in scenario.metrics if m.description}
+    units = {part.metric: unit_of(scenario.units, part.metric) for part in requirement.parts}
+    words = requirement_words(requirement, units[requirement.parts[0].metric], units)
+    told = "; ".join(f"{name}: {meanings[name].removesuffix('.')}" for name in units if name in meanings)
+    before, after = ((path.name, _ego(study)) for path, study in zip(paths, studies, strict=True))
+    return Question(f"{words} ({told})" if told else words, units, before, after)
+
+
+def _ego(study: Study) -> str:
+    """Return the ego in the words of its configuration."""
+    ego = study.config.ego
+    if ego is None:
+        return f"that of the scenario {study.config.scenario}"
+    settings = ", ".join(f"{name}: {value}" for name, value in ego.settings.items())
+    return f"{ego.kind}, {settings}" if settings else f"{ego.kind} with its default settings"
 
 
 def _said(study: Study, history: History, row: int) -> str:
@@ -305,6 +327,7 @@ def _result(first: History, second: History, requirement: Any) -> Json:
         raise InputError("compare-ego needs the same draws in both stores, but they differ: give another --store")
     critical = [requirement.critical_runs(h) for h in (first, second)]
     pairs = Pairs(critical[0], critical[1], ~first.ok, ~second.ok, first.columns["warm_up"])
+    metrics = tuple(dict.fromkeys(part.metric for part in requirement.parts))
     low, high = pairs.difference()
     before, after = (pairs.share(after=later) for later in (False, True))
     warm_up = first.columns["warm_up"]
@@ -313,11 +336,15 @@ def _result(first: History, second: History, requirement: Any) -> Json:
         "pairs": len(first), "confidence": _CONFIDENCE, **warmed, "before": before, "after": after,
         "difference": after["probability"] - before["probability"], "low": low, "high": high,
         "verdict": pairs.verdict(),
-        "fixed": _listed(first, pairs.fixed), "new": _listed(first, pairs.new),
+        "fixed": _listed(first, second, pairs.fixed, metrics), "new": _listed(first, second, pairs.new, metrics),
         "still": int((pairs.before & pairs.after).sum()),
     }  # fmt: skip
 
 
-def _listed(history: History, mask: Mask) -> list[Json]:
-    found = [history.record(int(k)) for k in np.flatnonzero(mask)]
-    return [{"run": r.index, "inputs": dict(r.inputs), "seed": r.seed} for r in found]
+def _listed(first: History, second: History, mask: Mask, metrics: Sequence[str]) -> list[Json]:
+    """Return the pairs of runs where the mask holds: inputs, seed, and these metrics with each ego."""
+    found = []
+    for k in map(int, np.flatnonzero(mask)):
+        run, (before, after) = first.record(k), ({m: float(h.y(m)[k]) for m in metrics} for h in (first, second))
+        found.append({"run": run.index, "inputs": dict(run.inputs), "seed": run.seed, "before": before, "after": after})
+    return found
