@@ -42,7 +42,7 @@ REASONS = {
     "side by side across lanes": r"side by side on lanes",
     "oncoming, across the middle": r"oncoming, across",
     "roads at a junction": r"on different roads at a junction",
-    "lanes of a junction that do not conflict": r"do not conflict",
+    "lanes of a junction that do not conflict": r"knows no conflict",
     "shapes with corners cut off, in a junction": r"SUMO's shapes \(cars",
     "in a junction and beside it": r"beside it, and SUMO compares a junction",
     "rear beside another lane": r"the rear of one reaches back",

@@ -13,10 +13,13 @@ from typing import Any
 import libsumo
 import pytest
 from departing import car, flow, run, stopped
+from own_networks import run_program
 
 from sbt.execution.spec import ScenarioSpec
 from sbt.sumo import phases
+from sbt.sumo.nets import unregulated
 from sbt.workflows.checking import check_scenario
+from sbt.workflows.findings import net_findings
 
 EGO = car("ego", "${p}", depart="3", speed="5")
 LATER = car("later", "20", depart="50", lane="1", speed="5")
@@ -114,3 +117,20 @@ def test_check_says_what_share_of_runs_is_invalid_and_where_the_time_goes(tmp_pa
     assert spent["warm-up_s"] == pytest.approx(0.1 * ok, rel=0.01)
     assert spent["run_s"] == pytest.approx(0.005 * ok, rel=0.05)
     assert spent["load_s"] == pytest.approx(0.1 * invalid["share"], rel=0.01), "invalid runs never reach the warm-up's end"
+
+
+def test_junctions_without_right_of_way_are_named(tmp_path: Path):
+    """At the hub of a spider net crossing streams drive through each other: most of what is critical there is the network's."""
+    run_program(tmp_path, "netgenerate", "--spider", "--spider.arm-number", "5", "--spider.circle-number", "2", "-o", "net.net.xml")
+    run_program(tmp_path, "netgenerate", "--grid", "--grid.number", "3", "-o", "grid.net.xml")
+    assert [unregulated(tmp_path / f"{name}.net.xml") for name in ("net", "grid")] == [("A1",), ()]
+    (tmp_path / "my.rou.xml").write_text('<routes><trip id="ego" depart="0" departSpeed="${speed}" from="A2A1" to="A1B1"/></routes>')
+    (tmp_path / "my.sumocfg").write_text(
+        '<configuration><input><net-file value="net.net.xml"/><route-files value="my.rou.xml"/></input></configuration>'
+    )
+    (tmp_path / "scenario.yaml").write_text(
+        "sumo: my.sumocfg\ninputs: {speed: {min: 2, max: 9, unit: m/s}}\nego: {id: ego, may_leave: true}\nduration: 2\n"
+        "metrics: [distance_min]\nrequirement: {metric: distance_min, critical: [-.inf, 0.5]}\n"
+    )
+    found = net_findings(ScenarioSpec(str(tmp_path / "scenario.yaml")).resolve(), {"speed": 5.0}, 1)
+    assert [finding.detail.partition(":")[0] for finding in found] == ["'A1' is unregulated"]

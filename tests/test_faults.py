@@ -21,6 +21,7 @@ from typer.testing import CliRunner
 
 from sbt import interruption
 from sbt.cli import app
+from sbt.cli.console import resumable
 from sbt.errors import StoreError
 from sbt.execution.pool import close_pool, open_pool
 from sbt.execution.streams import SteadyStream
@@ -190,6 +191,17 @@ def test_before_there_is_a_store_an_interruption_says_so(configured: Callable[..
     assert told.splitlines() == [
         "stopping (SIGINT): nothing was run yet; a second signal stops at once", "interrupted, nothing was run yet",
     ]  # fmt: skip
+
+
+def test_a_store_is_seen_from_where_a_run_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Loops with SUMO files run in the folder of these, whatever folder the store was named from."""
+    (tmp_path / "c").mkdir()
+    (tmp_path / "c" / "campaign.sqlite").touch()
+    monkeypatch.chdir(tmp_path)
+    with resumable() as work:
+        work.folder = Path("c")
+        monkeypatch.chdir("/")
+        assert work.consequence() == "run again to resume"
 
 
 @pytest.mark.slow

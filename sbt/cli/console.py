@@ -133,12 +133,21 @@ class _Resumable:
     """Work that can be resumed as soon as there is something in its folder."""
 
     def __init__(self, pattern: str, again: str):
-        self.folder: Path | None = None
+        self._folder: Path | None = None
         self._pattern, self._again = pattern, again
+
+    @property
+    def folder(self) -> Path | None:
+        """The folder; None as long as it is not known."""
+        return self._folder
+
+    @folder.setter
+    def folder(self, folder: Path) -> None:
+        self._folder = folder.absolute()  # a run may be in another working directory when the signal comes
 
     def consequence(self) -> str:
         """Return what an interruption means now."""
-        if self.folder is not None and any(self.folder.glob(self._pattern)):
+        if self._folder is not None and any(self._folder.glob(self._pattern)):
             return self._again
         return "nothing was run yet"
 

@@ -164,7 +164,8 @@ def _why(sumo: Any, a: _Place, b: _Place, moved: set[str]) -> str:
         foes = any(other in sumo.lane.getInternalFoes(lane) for lane, other in pairs)
         if foes:
             return f"in junction '{a.junction}' SUMO's shapes (cars with corners cut off, rears on their lanes) do not overlap"
-        return f"in junction '{a.junction}' lanes '{a.lane}' and '{b.lane}' do not conflict, and SUMO never compares them"
+        lanes = f"of lanes '{a.lane}' and '{b.lane}' in junction '{a.junction}'"
+        return f"SUMO knows no conflict {lanes} (unregulated ones have none), and never compares them"
     if a.junction or b.junction:
         inside, outside = (a, b) if a.junction else (b, a)
         return (

@@ -16,7 +16,7 @@ from sbt.plugins import kept, noted
 from sbt.problem.arrays import Points
 from sbt.sumo.places import made_here
 
-__all__ = ["Lane", "Roads", "lanes", "net_file", "nets_folder", "opened", "pavements", "roads"]
+__all__ = ["Lane", "Roads", "lanes", "net_file", "nets_folder", "opened", "pavements", "roads", "unregulated"]
 
 
 class Lane(NamedTuple):
@@ -127,6 +127,30 @@ def roads(net: Path) -> Roads:
     with opened(net) as file:
         parser.ParseFile(file)
     return found
+
+
+@kept
+def unregulated(net: Path) -> tuple[str, ...]:
+    """Return the junctions of a network file at which roads meet and nobody has right of way, as their type says.
+
+    SUMO lets crossing streams drive through each other there. A place where a single road bends or ends is none.
+    """
+    junctions: list[str] = []
+    beside: dict[str, set[str]] = {}
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        if tag == "junction" and attributes.get("type") == "unregulated":
+            junctions.append(attributes["id"])
+        elif tag == "edge" and "from" in attributes and "to" in attributes:
+            ends = attributes["from"], attributes["to"]
+            for here, there in (ends, ends[::-1]):
+                beside.setdefault(here, set()).add(there)
+
+    parser = xml.parsers.expat.ParserCreate()
+    parser.StartElementHandler = start
+    with opened(net) as file:
+        parser.ParseFile(file)
+    return tuple(name for name in junctions if len(beside.get(name, ())) > 2)
 
 
 def _lane(element: ET.Element, function: str) -> list[Lane]:

@@ -32,7 +32,7 @@ from sbt.sumo.suggesting import units_apart
 from sbt.workflows.comparing import compared_times
 from sbt.workflows.drawn import Told, covariates_first
 from sbt.workflows.fidelity import fidelity_findings
-from sbt.workflows.findings import Finding, row_findings, some_rows
+from sbt.workflows.findings import Finding, net_findings, row_findings, some_rows
 from sbt.workflows.rehearsal import rehearse
 from sbt.workflows.snapshots import fresh_instead, snapshot_findings, which_isolation
 
@@ -131,6 +131,7 @@ def _findings(spec: ScenarioSpec, seed: int, scenario: LogicalScenario | None, t
     yield run
     yield _finite(first, asked)
     yield from _warned(spec)
+    yield from net_findings(asked, *jobs[0])
     yield from _units(spec, asked.space)
     yield from _looks_beyond(first, asked)
     yield from rehearse(spec, asked, seed)

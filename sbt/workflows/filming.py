@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
 
 from sbt.errors import SbtError
 from sbt.execution.worker import run_traced
@@ -19,9 +18,10 @@ from sbt.problem.trace import Trace
 from sbt.report.reel import Film
 from sbt.store.history import History, Record
 from sbt.sumo.nets import Lane, lanes
+from sbt.workflows.networks import net_of
 from sbt.workflows.study import Study
 
-__all__ = ["film_runs", "net_of", "shown_requirement"]
+__all__ = ["film_runs", "shown_requirement"]
 
 
 _DIRECT = "The scenario gives its metrics directly: there is no trace to show."
@@ -76,7 +76,7 @@ def _film(scenario: LogicalScenario, runnable: LogicalScenario, record: Record, 
     if dict(outcome.metrics) != dict(record.metrics):
         return "executed again it is another one"
     need, metric = shown_requirement(runnable, trace)
-    net = net_of(runnable, record)
+    net = net_of(runnable, record.inputs, record.seed)
     return Film(record.index, role, trace, metric, need, () if net is None else _lanes(net, sha256(net.read_bytes()).digest()))
 
 
@@ -86,17 +86,3 @@ def shown_requirement(scenario: LogicalScenario, states: Trace) -> tuple[Require
     parts = scenario.requirement.parts
     need = next((part for part in parts if part.is_critical({part.metric: own[part.metric].value(states)})), parts[0])
     return need, own[need.metric]
-
-
-def net_of(scenario: LogicalScenario, record: Record) -> Path | None:
-    """Return the network in which a run took place, with its placeholders filled; None where its scenario names none."""
-    from sbt.sumo.nets import net_file
-    from sbt.sumo.session import scratch_folder
-    from sbt.sumo.template import template
-
-    simulate: Any = scenario.simulate
-    if hasattr(simulate, "files_of_run"):
-        files = simulate.files_of_run(record.inputs, record.seed)
-        return template(files.net).write(record.inputs, scratch_folder())
-    net = getattr(simulate, "net", None)
-    return None if net is None else net_file(net)

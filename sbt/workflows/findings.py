@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from sbt.errors import SbtError
 from sbt.loop.stages import notes_of
-from sbt.problem.plain import Value
+from sbt.problem.plain import Value, Values
 from sbt.problem.scenario import LogicalScenario
+from sbt.workflows.networks import net_of
 
-__all__ = ["Finding", "row_findings", "some_rows"]
+__all__ = ["Finding", "net_findings", "row_findings", "some_rows"]
 
 _TRIED = 17
 """Rows of a table that are looked up, spread over it; it has no centre and no corners."""
+_MOST_NAMED = 5
+"""Junctions that are named."""
 
 
 @dataclass(frozen=True)
@@ -50,3 +55,20 @@ def row_findings(scenario: LogicalScenario) -> Iterator[Finding]:
     if scenario.pool is not None:
         tried = f"{len(scenario.pool.x):,} rows; {len(some_rows(scenario))} of them are looked up for centre and corners."
         yield Finding("for information: recorded rows", ok=True, detail=" ".join([tried, *notes_of(scenario)]))
+
+
+def net_findings(scenario: LogicalScenario, values: Values, seed: int) -> list[Finding]:
+    """Return where nobody has right of way in the network of a run; nothing of one that cannot be read, as its run says why."""
+    from sbt.sumo.nets import unregulated
+
+    junctions: tuple[str, ...] = ()
+    with suppress(SbtError, OSError):
+        net = net_of(scenario, values, seed)
+        junctions = () if net is None else unregulated(net)
+    if not junctions:
+        return []
+    more = f" and {len(junctions) - _MOST_NAMED} more" if len(junctions) > _MOST_NAMED else ""
+    names = ", ".join(f"'{name}'" for name in junctions[:_MOST_NAMED])
+    what = "SUMO lets crossing streams drive through each other there; another type (priority, by netconvert)"
+    detail = f"{names}{more} {'is' if len(junctions) == 1 else 'are'} unregulated: {what} gives right of way"
+    return [Finding("for information: junctions without right of way", ok=True, detail=detail)]

@@ -9,7 +9,8 @@ from typing import Any
 from sbt.errors import InputError
 from sbt.problem.scenario import LogicalScenario
 from sbt.problem.trace import Trace
-from sbt.workflows.filming import net_of, shown_requirement
+from sbt.workflows.filming import shown_requirement
+from sbt.workflows.networks import net_of
 from sbt.workflows.running import Replay
 
 __all__ = ["net_of_run", "save_film", "show_replay", "shown_trace"]
@@ -92,7 +93,7 @@ def shown_trace(again: Replay) -> Trace:
 
 def net_of_run(again: Replay) -> Path | None:
     """Return the network in which a run took place, with its placeholders filled; None where its scenario names none."""
-    return net_of(again.scenario, again.record)
+    return net_of(again.scenario, again.record.inputs, again.record.seed)
 
 
 def save_film(file: Path, states: Trace, scenario: LogicalScenario, title: str, net: Path | None) -> None:
