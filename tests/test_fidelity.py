@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
+from sbt.campaigns.levels import LevelsTold
 from sbt.cli import app
 from sbt.config.source import ConfigError
 from sbt.errors import InputError, SbtError
@@ -220,6 +222,13 @@ def test_what_does_not_pay_is_left_out_and_said(tmp_path: Path) -> None:
     exact = {**NOISY, "scenario": "testbed:four_branch_7", "budget": 40}
     same = run(tmp_path / "exact", exact, fidelity={"scenario": "testbed:four_branch_7", "cost": 0.5})
     assert any("equal inputs give equal metrics" in sentence for sentence in same.sentences)
+
+
+def test_pairs_of_one_metric_promise_nothing() -> None:
+    """Where all runs of both levels had one time to collision a ratio of .67 was told of them."""
+    told = LevelsTold(coarse=20, fine=107, cost=0.3, correlation=None, pairs=8, pays=False, two_levels=1.5, one_level=1.0)
+    assert told.sentence().endswith("They were left out: 8 pairs told nothing of how alike both levels are.")
+    assert "0.67 times the runs" in replace(told, correlation=0.4).sentence()
 
 
 @pytest.mark.parametrize(

@@ -155,7 +155,7 @@ class LevelsTold:
 
     def sentence(self) -> str:
         """Return it in words."""
-        alike = f" and correlates with it by {number(self.correlation, 2)} ({self.pairs} pairs)" if self.correlation else ""
+        alike = f" and correlates with it by {number(self.correlation, 2)} ({self.pairs} pairs)" if self.correlation is not None else ""
         taught = f"{plural(self.coarse, 'coarse run')} taught {plural(self.fine, 'run')}"
         told = f"{taught}: a coarse run costs {number(self.cost, 2)} of a run{alike}"
         if self.pays is None:
@@ -166,6 +166,8 @@ class LevelsTold:
         times = self.one_level / self.two_levels
         if self.pays:
             return f"{told}, which promise that equal precision would take {number(times, 2)} times the runs without them."
+        if self.correlation is None:  # as where all runs have one metric
+            return f"{told}. They were left out: {plural(self.pairs, 'pair')} told nothing of how alike both levels are."
         much = f"without them equal precision would take {number(times, 2)} times the runs, as far as these pairs tell"
         return f"{told}. They do not clearly pay, and were left out: {much}."
 
