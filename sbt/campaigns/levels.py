@@ -155,7 +155,9 @@ class LevelsTold:
 
     def sentence(self) -> str:
         """Return it in words."""
-        alike = f" and correlates with it by {number(self.correlation, 2)} ({self.pairs} pairs)" if self.correlation is not None else ""
+        alike = ""
+        if self.correlation is not None:
+            alike = f" and correlates with it by {number(self.correlation, 2)} ({plural(self.pairs, 'pair')})"
         taught = f"{plural(self.coarse, 'coarse run')} taught {plural(self.fine, 'run')}"
         told = f"{taught}: a coarse run costs {number(self.cost, 2)} of a run{alike}"
         if self.pays is None:
