@@ -132,5 +132,5 @@ def test_junctions_without_right_of_way_are_named(tmp_path: Path):
         "sumo: my.sumocfg\ninputs: {speed: {min: 2, max: 9, unit: m/s}}\nego: {id: ego, may_leave: true}\nduration: 2\n"
         "metrics: [distance_min]\nrequirement: {metric: distance_min, critical: [-.inf, 0.5]}\n"
     )
-    found = net_findings(ScenarioSpec(str(tmp_path / "scenario.yaml")).resolve(), {"speed": 5.0}, 1)
+    found = net_findings(ScenarioSpec(str(tmp_path / "scenario.yaml")).resolve(), [({"speed": 5.0}, 1)])
     assert [finding.detail.partition(":")[0] for finding in found] == ["'A1' is unregulated"]

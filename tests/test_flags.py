@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import sbt
@@ -143,3 +144,31 @@ def test_what_no_run_was_may_be_all_the_same(tmp_path: Path, campaign: str):
     assert told["p_critical"].tolist() == pytest.approx([doubt, 1.0], abs=1e-3)
     drawn = found.fitted.predict(np.array([[0.1, 0.5]]))  # by figures and reports
     assert drawn.probability(found.scenario.requirement.critical) == pytest.approx(doubt, abs=1e-3)
+
+
+def test_exported_points_of_a_flag_are_where_it_is_told_to_be_as_likely_as_not(tmp_path: Path):
+    found = run_of_flags(tmp_path / "s", campaign="falsification", budget=80, seed=1)
+    points = pd.read_csv(found.export("boundary"))
+    told = found.predict(points[[f"x.{name}" if f"x.{name}" in points else name for name in "ab"]])["p_critical"]
+    assert len(told) > 10
+    assert told.tolist() == pytest.approx([0.5] * len(told), abs=0.01)
+
+
+def test_what_earlier_runs_taught_is_told_where_own_ones_have_one_value(tmp_path: Path):
+    run_of_flags(tmp_path / "before", campaign="boundary", budget=60, seed=1)
+    few = {"campaign": "boundary", "budget": 8, "initial": 8, "validation": {"share": 0.0}}
+    found = run_of_flags(tmp_path / "s", seed=5, warm_start={"store": str(tmp_path / "before")}, **few)
+    assert not found.frame["critical"].any()
+    p = found.predict({"a": [0.3, 0.9], "b": [0.6, 0.1]})["p_critical"]
+    assert p[0] > 0.9
+    assert p[1] < 0.05  # and not 1 / 10 at both
+
+
+def test_of_combinations_that_all_were_run_repeats_count(tmp_path: Path):
+    inputs = [sbt.Parameter("k", 0, 2, kind="integer"), sbt.Parameter("kind", choices=["car", "truck"])]
+    scenario = sbt.Scenario("none", inputs, sbt.Requirement("hit", low=0.5), evaluate=lambda values, seed: {"hit": 0.0})
+    given: dict[str, Any] = {"metamodel": {"kind": "gp"}, "executor": "serial", "report": False}
+    found = sbt.run(campaign="coverage", scenario=scenario, budget=30, store=tmp_path / "s", **given)
+    runs = found.history.finished
+    assert len(np.unique(runs.x, axis=0)) == 6
+    assert found.predict({"k": 1, "kind": "car"})["p_critical"].tolist() == pytest.approx([1.0 / (len(runs) + 2.0)])

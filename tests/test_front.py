@@ -218,6 +218,7 @@ WRONG = {
     "run as text": (lambda s: sbt.open(s, scenario=scenario_of()).replay("0"), r"a run must be its index, but got '0'"),
     "forms": (lambda s: sbt.open(s).export(["csv"]), r"the format must be text, but got \['csv'\]"),
     "uneven rows": (lambda s: sbt.open(s).predict([{"a": 0.1, "b": 0.5}, {"a": 0.1}]), r"row 0 has a, b, row 1 a$"),
+    "rows of numbers": (lambda s: sbt.open(s).predict([{1: 0.1, 2: 0.2}, {1: 0.1}]), r"row 0 has 1, 2, row 1 1$"),
     "form": (lambda s: sbt.open(s).export("cvs"), r"did you mean 'csv'"),
 }
 
@@ -236,6 +237,7 @@ def test_a_store_made_with_an_object_opens_without_it(store):
     assert (frame["critical"] == (frame["margin"] <= 0)).all()
     assert len(result.predict(frame)) == 24
     assert result.predict([{"a": 0.1, "b": 0.5}, {"b": 0.2, "a": 0.3}]).equals(result.predict([[0.1, 0.5], [0.3, 0.2]]))
+    assert result.predict([frame.iloc[3], frame.iloc[0]])["mean"].tolist() == result.predict(frame.iloc[[3, 0]])["mean"].tolist()
     assert result.predict(frame.iloc[3])["p_critical"].tolist() == result.predict(frame.iloc[[3]])["p_critical"].tolist()
     assert "disc" in repr(result)
     assert "object:" not in repr(result) + result._repr_html_()

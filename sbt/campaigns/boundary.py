@@ -240,8 +240,9 @@ def boundary_points(settings: Settings, history: History, most: int = 500) -> Po
     """
     if settings.learner is None or len(history.finished) < 2:
         raise InputError("boundary points need a metamodel and two finished runs, but there are none")
-    predictor, _ = settings.learner.over_traffic(settings.learner.train(history.finished), history)
-    predict = settings.learner.on_inputs(predictor, len(history.finished))
+    learner = settings.learner.telling(history)
+    predictor, _ = learner.over_traffic(learner.train(history.finished), history)
+    predict = learner.on_inputs(predictor, len(history.finished))
     space, critical = settings.scenario.space, settings.scenario.requirement.critical
     sequence = SobolSequence(space.dimension, settings.seed)
     u = sequence.admissible(lambda v: space.feasible(space.from_unit(v)), 8192, 2048)

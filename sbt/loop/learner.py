@@ -116,10 +116,20 @@ class Learner:
 
     def told(self, predict: Predictor, history: History) -> Predictor:
         """Return a predictor as it is told: margins in the units that those of the runs have, doubt of metrics of one value."""
-        requirement, runs = self.scenario.requirement.in_units_of(history), history.finished
-        return with_unvaried(
-            in_units(predict, requirement.critical), runs.x, [part.values(runs) for part in requirement.parts]
-        )  # fmt: skip
+        requirement, runs, space = self.scenario.requirement.in_units_of(history), history.finished, self.scenario.space
+        y, before = np.column_stack([part.values(runs) for part in requirement.parts]), np.empty((0, len(requirement.parts)))
+        if any(len(np.unique(each[np.isfinite(each)])) == 1 for each in y.T) and (earlier := self._helping(runs)) is not None:
+            before = earlier.y.reshape(-1, y.shape[1])
+        inputs, every = len(np.unique(runs.x, axis=0)), space.combinations
+        n = len(y) if every is not None and inputs == len(every) else inputs  # repeats tell of no other inputs
+        return with_unvaried(in_units(predict, requirement.critical), np.concatenate([before, y]).T, len(before) + n)
+
+    def _helping(self, training: History) -> EarlierRuns | None:
+        """Return the earlier runs where these are predicted no worse with them."""
+        u, y = self.inputs(self.scenario.space.to_unit(training.x)), self.scenario.requirement.values(training)
+        rng = stream(self.seed, "earlier", len(training))
+        critical = self.scenario.requirement.critical
+        return self.earlier if self.earlier is not None and self.earlier.helps(u, y, critical, rng) else None
 
     def over_traffic(self, predictor: Predictor, history: History) -> tuple[Predictor, str | None]:
         """Return a predictor with P(critical) as the mean over traffic, and what a record keeps of it; or itself, None."""
@@ -170,11 +180,9 @@ class Learner:
         """Return the metamodel fitted to these runs, and how many earlier ones it learned from; None: there are none."""
         requirement, rng = self.scenario.requirement, stream(self.seed, "fit", len(training))
         u, y = self.inputs(self.scenario.space.to_unit(training.x)), requirement.values(training)
-        taken, earlier = None, self.earlier
-        if earlier is not None:
-            helps = earlier.helps(u, y, requirement.critical, stream(self.seed, "earlier", len(training)))
-            taken = len(earlier) if helps else 0
-            u, y = earlier.joined(u, y) if helps else (u, y)
+        earlier = self._helping(training)
+        taken = None if self.earlier is None else 0 if earlier is None else len(earlier)
+        u, y = (u, y) if earlier is None else earlier.joined(u, y)
         metamodel = metamodel_for(self.metamodel, requirement.critical, target_aware=self.target_aware)
         with named_errors(self.metamodel, len(y)):
             return metamodel.fit(u, y, rng), taken

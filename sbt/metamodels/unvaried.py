@@ -5,7 +5,7 @@ A metamodel is sure of a constant, wherever it is asked. Where no run of fifty c
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,18 +37,18 @@ class UnvariedPrediction(Prediction):
         return (same, other) if critical.contains(np.array([self.value]))[0] else (other, same)
 
 
-def with_unvaried(predict: Predictor, u: Points, values: Sequence[Vector]) -> Predictor:
+def with_unvaried(predict: Predictor, values: Iterable[Vector], n: int) -> Predictor:
     """Return a predictor that doubts metrics of which it knows one value, by the rule of succession; itself where it knows more.
 
     Args:
         predict: of one metric, or of a combination of q.
-        u: (n, d) inputs of the runs.
-        values: (n,) of each metric, NaN where a run has none.
+        values: of each metric in all runs, NaN where a run has none.
+        n: independent outcomes among them.
 
     Source:
         Laplace (1774): after n equal outcomes the next one is another with probability 1 / (n + 2).
     """
-    doubts: list[Callable[[Prediction], Prediction]] = [_doubt(u, y) for y in values]
+    doubts: list[Callable[[Prediction], Prediction]] = [_doubt(y, n) for y in values]
     if all(doubt is _none for doubt in doubts):
         return predict
 
@@ -61,12 +61,12 @@ def with_unvaried(predict: Predictor, u: Points, values: Sequence[Vector]) -> Pr
     return told
 
 
-def _doubt(u: Points, y: Vector) -> Callable[[Prediction], Prediction]:
-    """Return what doubts the prediction of a metric y (n,) at u (n, d); nothing where it has several values."""
-    known = np.isfinite(y)
-    if not known.any() or np.ptp(y[known]) > 0.0:
+def _doubt(y: Vector, n: int) -> Callable[[Prediction], Prediction]:
+    """Return what doubts the prediction of a metric y with n independent outcomes; nothing where it has several values."""
+    known = y[np.isfinite(y)]
+    if not len(known) or np.ptp(known) > 0.0:
         return _none
-    value, other = float(y[known][0]), 1.0 / (len(np.unique(u[known], axis=0)) + 2.0)
+    value, other = float(known[0]), 1.0 / (min(n, len(known)) + 2.0)
     return lambda found: UnvariedPrediction(found.mean, found.std, found.weight, found.noise, value=value, other=other)
 
 

@@ -131,7 +131,7 @@ def _findings(spec: ScenarioSpec, seed: int, scenario: LogicalScenario | None, t
     yield run
     yield _finite(first, asked)
     yield from _warned(spec)
-    yield from net_findings(asked, *jobs[0])
+    yield from net_findings(asked, jobs)
     yield from _units(spec, asked.space)
     yield from _looks_beyond(first, asked)
     yield from rehearse(spec, asked, seed)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 
@@ -57,14 +57,14 @@ def row_findings(scenario: LogicalScenario) -> Iterator[Finding]:
         yield Finding("for information: recorded rows", ok=True, detail=" ".join([tried, *notes_of(scenario)]))
 
 
-def net_findings(scenario: LogicalScenario, values: Values, seed: int) -> list[Finding]:
-    """Return where nobody has right of way in the network of a run; nothing of one that cannot be read, as its run says why."""
+def net_findings(scenario: LogicalScenario, jobs: Sequence[tuple[Values, int]]) -> list[Finding]:
+    """Return where nobody has right of way in the network of the first run; nothing of one that cannot be read: runs say why."""
     from sbt.sumo.nets import unregulated
 
     junctions: tuple[str, ...] = ()
     with suppress(SbtError, OSError):
-        net = net_of(scenario, values, seed)
-        junctions = () if net is None else unregulated(net)
+        nets = [net_of(scenario, *job) for job in jobs[:1]]
+        junctions = tuple(name for net in nets if net is not None for name in unregulated(net))
     if not junctions:
         return []
     more = f" and {len(junctions) - _MOST_NAMED} more" if len(junctions) > _MOST_NAMED else ""

@@ -184,16 +184,22 @@ def inputs_from(given: Any, space: ParameterSpace) -> tuple[Points, tuple[str, .
 
 
 def _table_of(given: Any) -> Any:
-    """Return a row of a DataFrame as a mapping, and a list of mappings as one of columns; all else as it is."""
-    if hasattr(given, "keys") and getattr(given, "ndim", 2) == 1:
+    """Return a row of a DataFrame as a mapping, and a list of rows as one of columns; all else as it is."""
+    if _is_row(given):
         return dict(given.items())
-    if not isinstance(given, list | tuple) or not given or not all(isinstance(row, Mapping) for row in given):
+    if not isinstance(given, list | tuple) or not given or not all(map(_is_row, given)):
         return given
-    names = list(given[0])
+    names = list(given[0].keys())
     for k, row in enumerate(given):
-        if set(row) != set(names):
-            raise InputError(f"all rows must have the same inputs, but row 0 has {', '.join(names)}, row {k} {', '.join(row)}")
+        if set(row.keys()) != set(names):
+            first, other = (", ".join(map(str, keys)) for keys in (names, row.keys()))
+            raise InputError(f"all rows must have the same inputs, but row 0 has {first}, row {k} {other}")
     return {name: [row[name] for row in given] for name in names}
+
+
+def _is_row(given: Any) -> bool:
+    """Return whether it is a mapping, or a row of a DataFrame, and no DataFrame."""
+    return isinstance(given, Mapping) or (hasattr(given, "keys") and getattr(given, "ndim", 2) == 1)
 
 
 def _column_of(given: Any, parameter: Parameter) -> Vector:
