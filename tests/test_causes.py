@@ -134,3 +134,7 @@ def test_junctions_without_right_of_way_are_named(tmp_path: Path):
     )
     found = net_findings(ScenarioSpec(str(tmp_path / "scenario.yaml")).resolve(), [({"speed": 5.0}, 1)])
     assert [finding.detail.partition(":")[0] for finding in found] == ["'A1' is unregulated"]
+
+
+def test_a_net_of_a_simulation_of_ones_own_may_be_anything():
+    assert net_findings(SimpleNamespace(simulate=SimpleNamespace(net={"layers": 3})), [({}, 0)]) == []

@@ -22,4 +22,4 @@ def net_of(scenario: LogicalScenario, values: Values, seed: int) -> Path | None:
         files = simulate.files_of_run(values, seed)
         return template(files.net).write(values, scratch_folder())
     net = getattr(simulate, "net", None)
-    return None if net is None else net_file(net)
+    return net_file(net) if isinstance(net, str) else None  # something else of a class of one's own is no network of SUMO's
