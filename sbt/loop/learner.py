@@ -114,9 +114,15 @@ class Learner:
         followed = self.metamodel == replace(Auto().simplest, kernels=1)  # by a search, unless another one is chosen
         return replace(self, metamodel=auto if followed else self.metamodel, target_aware=True)
 
-    def told(self, predict: Predictor, history: History) -> Predictor:
-        """Return a predictor as it is told: margins in the units that those of the runs have, doubt of metrics of one value."""
-        requirement, runs, space = self.scenario.requirement.in_units_of(history), history.finished, self.scenario.space
+    def told(self, predict: Predictor, history: History, runs: History) -> Predictor:
+        """Return a predictor as it is told: margins in the units that those of all runs have, doubt of metrics of one value.
+
+        Args:
+            predict: of the metric, or of a combination.
+            history: all runs.
+            runs: those that it has learned from.
+        """
+        requirement, space = self.scenario.requirement.in_units_of(history), self.scenario.space
         y, before = np.column_stack([part.values(runs) for part in requirement.parts]), np.empty((0, len(requirement.parts)))
         if any(len(np.unique(each[np.isfinite(each)])) == 1 for each in y.T) and (earlier := self._helping(runs)) is not None:
             before = earlier.y.reshape(-1, y.shape[1])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import xml.etree.ElementTree as ET
 import xml.parsers.expat
+from collections import Counter
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -133,16 +134,18 @@ def roads(net: Path) -> Roads:
 def unregulated(net: Path) -> tuple[str, ...]:
     """Return the junctions of a network file at which roads meet and nobody has right of way, as their type says.
 
-    SUMO lets crossing streams drive through each other there. A place where a single road bends or ends is none.
+    SUMO lets crossing streams drive through each other there. A place where a single road bends, ends or splits is none.
     """
     junctions: list[str] = []
     beside: dict[str, set[str]] = {}
+    entered: Counter[str] = Counter()
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         if tag == "junction" and attributes.get("type") == "unregulated":
             junctions.append(attributes["id"])
         elif tag == "edge" and "from" in attributes and "to" in attributes:
             ends = attributes["from"], attributes["to"]
+            entered[ends[1]] += 1
             for here, there in (ends, ends[::-1]):
                 beside.setdefault(here, set()).add(there)
 
@@ -150,7 +153,7 @@ def unregulated(net: Path) -> tuple[str, ...]:
     parser.StartElementHandler = start
     with opened(net) as file:
         parser.ParseFile(file)
-    return tuple(name for name in junctions if len(beside.get(name, ())) > 2)
+    return tuple(name for name in junctions if len(beside.get(name, ())) > 2 and entered[name] > 1)
 
 
 def _lane(element: ET.Element, function: str) -> list[Lane]:

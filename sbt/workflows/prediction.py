@@ -128,7 +128,7 @@ def predict_inputs(
     if len(training) < 2:
         raise InputError(f"predict needs two runs to learn from, but {folder} has {len(training)}")
     predictor, source = _predictor(folder, learner, history, json.dumps(choice.model_dump(mode="json"), sort_keys=True), device)
-    u, predict, parts = learner.inputs(space.to_unit(x)), learner.told(predictor, history), []
+    u, predict, parts = learner.inputs(space.to_unit(x)), learner.told(predictor, history, training), []
     for k in range(0, len(u), _CHUNK):
         p = predicted(predict, u[k : k + _CHUNK])
         each = p.parts if isinstance(p, JointPrediction) else ()

@@ -156,7 +156,7 @@ class Result(Generic[C]):
         learner, fitted = self.study.learner, self.study.fit(self.history)
         if learner is None or fitted is None:
             return None
-        return replace(fitted, predict=learner.told(fitted.predict, self.history))
+        return replace(fitted, predict=learner.told(fitted.predict, self.history, self.history.training))
 
     @property
     def plot(self) -> Plots:

@@ -245,7 +245,7 @@ def _report(
     scenario = replace(study.scenario, requirement=study.scenario.requirement.in_units_of(log.history))
     told = sensitivities_in(study, log) if getattr(conclusion, "probability", None) else ()
     learner = None if fitted is None else study.learner
-    predict = None if fitted is None or learner is None else learner.told(fitted.predict, log.history)
+    predict = None if fitted is None or learner is None else learner.told(fitted.predict, log.history, log.history.training)
     film = partial(film_runs, study, store.history())
     return write_report(store, scenario, predict, conclusion, folder=target, sensitivity=told, film=film, note=note)
 
