@@ -60,7 +60,7 @@ def test_what_goes_wrong_in_a_run_is_its_row_with_the_place(analytic: Path):
     assert [found[k].status for k in range(6)] == ["ok", "ok", "ok", "failed", "failed", "failed"]
     line = 1 + next(k for k, text in enumerate(analytic.read_text().splitlines()) if "# marked" in text)
     assert found[3].reason == f"KeyError: 'no such thing' ({analytic}:{line})"
-    assert found[4].reason == "metric y must be finite, inf or -inf, but got nan"
+    assert found[4].reason == 'metric y must be finite, inf or -inf, but got nan; the run gave {"noise": 0.0}'
     assert found[5].reason.startswith("KeyError: 'b' (")
     assert all(o.metrics == {} for o in found.values() if o.status != Status.OK)
     with LocalExecutor(spec(analytic), 1) as local:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal, norm
@@ -13,11 +17,13 @@ from sbt.config.load import parse
 from sbt.errors import InputError
 from sbt.estimators.surrogate import fit_log_probability
 from sbt.loop.several import independence
+from sbt.loop.stages import Facts, sentences_of
 from sbt.metamodels.gaussian_process import GaussianProcess
 from sbt.metamodels.joint import JointMetamodel, JointPrediction, joined_log_probability
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.warp import JointWarp
 from sbt.problem.combination import MARGIN, CombinedInterval, all_of, any_of, from_plain, to_plain
+from sbt.problem.outcome import given
 from sbt.problem.requirement import CriticalInterval, Requirement
 from tests.measured_runs import Runs
 
@@ -282,3 +288,28 @@ def test_what_is_predicted_of_a_margin_has_the_units_of_the_runs(tmp_path, monke
     for predicted in (kept["predict"](u), result.fitted.predict(u)):
         np.testing.assert_allclose(predicted.mu, margin, atol=0.05)
     np.testing.assert_allclose(result.predict(u)["mean"], margin, atol=0.05)
+
+
+@pytest.mark.parametrize("campaign", ["falsification", "boundary"])
+def test_a_failed_run_that_is_critical_by_what_it_gave_is_told(tmp_path: Path, campaign: str):
+    """Nothing told of it: "not falsified", and "17 runs failed and say nothing about safety"."""
+
+    def simulate(values: dict[str, float], seed: int) -> dict[str, float]:
+        hit = values["a"] > 0.8
+        return {"hit": float(hit), "late": math.nan if hit else 5.0 - values["a"]}
+
+    either = sbt.any_of(sbt.Requirement("hit", low=0.5), sbt.Requirement("late", high=0.0))
+    scenario = sbt.Scenario("s", [sbt.Parameter("a", 0.0, 1.0)], either, evaluate=simulate, metrics=["hit", "late"])
+    found = sbt.run(campaign=campaign, scenario=scenario, budget=20, store=tmp_path / "s", executor="serial", report=False)
+    failed = found.frame[found.frame["status"] == "failed"]
+    assert given(failed["reason"].iloc[0]) == {"hit": 1.0}
+    told = f"{len(failed)} of the runs that failed (such as run {failed['index'].iloc[0]}) are critical by what they gave"
+    assert any(sentence.startswith(told) for sentence in found.sentences())
+    assert not critical_by_what_they_gave(found, "late")
+
+
+def critical_by_what_they_gave(found: sbt.Result, metric: str) -> bool:
+    """Return whether a conclusion says so of a requirement on one of its metrics alone."""
+    need = next(part for part in found.scenario.requirement.parts if part.metric == metric)
+    facts = replace(Facts.of(found.history, found.scenario), requirement=need)
+    return any("are critical by what they gave" in sentence for sentence in sentences_of(found.conclusion, facts))

@@ -68,7 +68,7 @@ def recipe(settings: Settings) -> Campaign:
     def conclude(log: Log) -> tuple[FalsificationConclusion, FittedMetamodel | None]:
         fitted = learner.telling(log.history).fit(log.history)
         found = failures.conclusion(log, None if fitted is None else fitted.record)
-        return replace(found, fidelity=screening_told(log, settings), earlier=earlier_told(log, settings)), fitted
+        return replace(found, fidelity=screening_told(log, settings), earlier=earlier_told(log, settings, learned=False)), fitted
 
     search: Stage = SearchStage(failures)
     if settings.coarse_cost is not None:

@@ -29,12 +29,14 @@ class EarlierTold:
             runs gave here; left out where fewer than five runs tell it, or all gave the same.
         again: critical runs of the earlier campaign that were run again.
         critical: of these, here.
+        learned: what it lets expect is used where it helps; otherwise its critical runs alone are.
     """
 
     runs: int
     correlations: Mapping[str, float] = field(default_factory=dict)
     again: int = 0
     critical: int = 0
+    learned: bool = True
 
     def sentences(self) -> list[str]:
         """Return in words how like the two setups are."""
@@ -42,10 +44,9 @@ class EarlierTold:
         if self.correlations:
             each = ", ".join(f"{number(value, 2)} ({name})" for name, value in self.correlations.items())
             here = plural(self.runs, "run")
-            said.append(
-                f"What the earlier campaign lets expect has a rank correlation of {each} with {here} of this one; it is used as"
-                " far as it predicts them better."
-            )
+            used = "it is used as far as it predicts them better" if self.learned else "a search takes its critical runs alone"
+            alike = f"What the earlier campaign lets expect has a rank correlation of {each} with {here} of this one"
+            said.append(f"{alike}; {used}.")
         if self.again:
             were = "was" if self.critical == 1 else "were"
             again = plural(self.again, "critical run")
@@ -53,8 +54,8 @@ class EarlierTold:
         return said
 
 
-def earlier_told(log: Log, settings: Settings) -> EarlierTold | None:
-    """Return how well the earlier campaign predicts this one's runs; None where there is none of another setup."""
+def earlier_told(log: Log, settings: Settings, *, learned: bool = True) -> EarlierTold | None:
+    """Return how well the earlier campaign predicts this one's runs, from which it learned or not; None: of the same setup."""
     if settings.transfer is None:
         return None
     from scipy.stats import spearmanr
@@ -73,4 +74,4 @@ def earlier_told(log: Log, settings: Settings) -> EarlierTold | None:
         if np.ptp(expected) > 0.0:
             correlations[part.told_as] = float(spearmanr(expected, trend.warp.values(y[finite])).statistic)
             counted = max(counted, int(finite.sum()))
-    return EarlierTold(counted, correlations, len(again), int(requirement.critical_runs(again).sum()))
+    return EarlierTold(counted, correlations, len(again), int(requirement.critical_runs(again).sum()), learned)

@@ -11,7 +11,7 @@ import numpy as np
 
 from sbt.errors import InputError
 from sbt.loop.learner import FittedMetamodel
-from sbt.problem.outcome import Doubt
+from sbt.problem.outcome import Doubt, given
 from sbt.problem.plain import Json, unit_of, written
 from sbt.problem.pool import Pool
 from sbt.problem.requirement import Requirement
@@ -133,6 +133,11 @@ class Facts:
 def sentences_of(conclusion: Conclusion, facts: Facts) -> list[str]:
     """Return the sentences of a conclusion, and what a metric of the requirement is that has no unit, where that is known."""
     said = conclusion.sentences(facts)
+    violating = _violating(facts)
+    if said and violating:
+        which = f"{len(violating):,} of the runs that failed (such as run {violating[0]}) are critical by what they gave"
+        rule = "they count as failed, not as critical: give the metric that was no number a value for where there is none"
+        said = [*said[:3], f"{which}; {rule}.", *said[3:]]
     odd = int(facts.history.doubtful(Doubt.IMPOSSIBLE).sum())
     if said and odd:
         which = f"In {odd:,} of {len(facts.history):,} runs the ego moves as no vehicle can"
@@ -152,6 +157,18 @@ def sentences_of(conclusion: Conclusion, facts: Facts) -> list[str]:
     bare = [part.metric for part in facts.requirement.parts if not unit_of(facts.units, part.metric)]
     meant = [f"{metric}: {facts.meanings[metric]}." for metric in bare if metric in facts.meanings]
     return said and [*said, *meant, *facts.notes]
+
+
+def _violating(facts: Facts) -> list[int]:
+    """Return the indices of failed runs that are critical by the metrics which they gave."""
+    found = []
+    for row in np.flatnonzero(~facts.history.ok).tolist():
+        metrics = given(str(facts.history.columns["reason"][row]))
+        values = np.array([[metrics.get(part.metric, np.nan) for part in facts.requirement.parts]])
+        critical = facts.requirement.critical
+        if metrics and bool(critical.contains(values if facts.requirement.combined else values[:, 0])[0]):
+            found.append(int(facts.history.index[row]))
+    return found
 
 
 def notes_of(scenario: LogicalScenario) -> tuple[str, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from numbers import Real
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 from sbt import plugins
 from sbt.errors import InputError, RunError, must_be, must_take, shown
 from sbt.problem.arrays import FARTHEST, Vector
-from sbt.problem.outcome import Status
+from sbt.problem.outcome import Status, with_given
 from sbt.problem.trace import Trace
 
 __all__ = ["Metric", "meaningful", "metric_from"]
@@ -105,6 +105,26 @@ def meaningful(name: str, value: object) -> float:
     if abs(number) <= FARTHEST or math.isinf(number):
         return number
     raise _unbounded(name, "" if math.isnan(number) else _WITHIN, str(number))
+
+
+def measured(values: Mapping[str, Callable[[], float]]) -> dict[str, float]:
+    """Return metrics by name; all are tried, so that a run that fails says what it gave beside the metric that it did not.
+
+    Raises:
+        RunError: one is no number.
+    """
+    found: dict[str, float] = {}
+    failed: RunError | None = None
+    for name, value in values.items():
+        try:
+            found[name] = value()
+        except RunError as error:
+            if error.status != Status.FAILED:
+                raise
+            failed = failed or error
+    if failed is not None:
+        raise RunError(failed.status, with_given(failed.reason, found)) from failed
+    return found
 
 
 def as_number(name: str, value: Any) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -10,7 +11,7 @@ from sbt.problem.plain import Values
 
 __all__ = [
     "CROSSED", "IMPOSSIBLE", "LISTED_ONLY", "OTHER_LEVEL", "STOPPED", "STRUCK", "TELEPORTED", "UNCONFIRMED", "Doubt", "Job",
-    "Outcome", "Status", "doubts",
+    "Outcome", "Status", "doubts", "given", "reason_alone", "with_given",
 ]  # fmt: skip
 
 UNCONFIRMED, LISTED_ONLY = "contact with ", "listed with "
@@ -21,6 +22,32 @@ IMPOSSIBLE, STOPPED = "as no vehicle can: ", "stopped dead: "
 """How the text begins of a motion of the ego, and of another, that no tyre holds: commanded, or done by SUMO."""
 TELEPORTED, CROSSED = "teleported: ", "moved over a junction: "
 """How the text begins of a road user near the ego that was moved to another place, and of one over a junction without lanes."""
+
+_GAVE = "; the run gave "
+"""What stands in a reason before the metrics that a failed run gave beside the one that it did not."""
+
+
+def with_given(reason: str, metrics: Mapping[str, float]) -> str:
+    """Return the reason why a run failed, with the metrics that it gave."""
+    return f"{reason}{_GAVE}{json.dumps(dict(metrics))}" if metrics else reason
+
+
+def given(reason: str) -> dict[str, float]:
+    """Return the metrics that a failed run gave, by its reason.
+
+    >>> given(with_given("metric pet must be finite, inf or -inf, but got nan", {"collision": 1.0}))
+    {'collision': 1.0}
+    """
+    try:
+        found = json.loads(reason.rpartition(_GAVE)[2]) if _GAVE in reason else {}
+    except ValueError:  # a text of somebody's own
+        return {}
+    return {str(name): float(value) for name, value in found.items()} if isinstance(found, dict) else {}
+
+
+def reason_alone(reason: str) -> str:
+    """Return why a run failed, without what it gave."""
+    return reason.partition(_GAVE)[0]
 
 
 class Doubt(StrEnum):

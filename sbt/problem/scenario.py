@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Protocol, runtime_checkable
 
 from sbt.errors import InputError, RunError, did_you_mean, must_be, must_take
 from sbt.problem.evenness import spread_evenly
-from sbt.problem.metric import Metric, meaningful, metric_from
+from sbt.problem.metric import Metric, meaningful, measured, metric_from
 from sbt.problem.outcome import Status
 from sbt.problem.parameter import Parameter
 from sbt.problem.plain import Values
@@ -272,7 +272,7 @@ class LogicalScenario:
     def measure(self, trace: Trace) -> dict[str, float]:
         """Return every metric of a trace by name."""
         seen = trace.measured
-        return {metric.name: metric(seen) for metric in self.metrics}
+        return measured({metric.name: partial(metric, seen) for metric in self.metrics})
 
     def run(self, values: Values, seed: int) -> dict[str, float]:
         """Run one concrete scenario and return its metrics.
@@ -323,4 +323,4 @@ def _checked(returned: Any, names: tuple[str, ...]) -> dict[str, float]:
         hint = f"; declare all of them: metrics={given}" if set(names) < set(given) else ""
         rule = f"a run must give the metrics {', '.join(names)}"
         raise RunError(Status.FAILED, f"{rule}, but gave {', '.join(given) or 'none'}{hint}")
-    return {name: meaningful(name, returned[name]) for name in names}
+    return measured({name: partial(meaningful, name, returned[name]) for name in names})

@@ -14,7 +14,7 @@ from sbt.campaigns.parts import share_among_held_out
 from sbt.campaigns.wording import input_value, number, percent, requirement_words, written_unit
 from sbt.estimators.binomial import upper
 from sbt.loop.stages import Conclusion, Facts, few_combinations, notes_of, sentences_of
-from sbt.problem.outcome import Doubt
+from sbt.problem.outcome import Doubt, reason_alone
 from sbt.problem.parameter import Parameter
 from sbt.problem.plain import JsonMapping
 from sbt.problem.requirement import Requirement
@@ -199,7 +199,7 @@ def _about_runs(found: Findings) -> list[str]:
     failed = history.where(~history.ok)
     if len(failed):
         reasons = (reason or status for reason, status in zip(failed.reason, failed.status, strict=True))
-        reason, times = Counter(map(str, reasons)).most_common(1)[0]
+        reason, times = Counter(reason_alone(str(each)) for each in reasons).most_common(1)[0]
         sentences.append(
             f"{len(failed):,} of {len(history):,} runs failed ({percent(len(failed) / len(history))}) and tell nothing"
             f" about safety. Most frequent reason ({times:,} times): {shorten(reason, 200, placeholder=' ...')}"
