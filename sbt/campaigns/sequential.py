@@ -283,7 +283,7 @@ class SequentialStage:
         requirement = self.settings.scenario.requirement
         noise, y = simulator_noise(log.history, requirement).std or 0.0, requirement.told(log.history)
         y = y[np.isfinite(y)]
-        return noise > _BLUR * float(np.median(np.abs(y - np.median(y))))
+        return bool(len(y)) and noise > _BLUR * float(np.median(np.abs(y - np.median(y))))
 
     def _common(self, log_probability: LogProbability | None, iteration: int) -> bool:
         """Return whether the metamodel takes more than 1 in 50 draws from the inputs' distribution to be critical."""
