@@ -306,6 +306,8 @@ def test_a_failed_run_that_is_critical_by_what_it_gave_is_told(tmp_path: Path, c
     told = f"{len(failed)} of the runs that failed (such as run {failed['index'].iloc[0]}) are critical by what they gave"
     assert any(sentence.startswith(told) for sentence in found.sentences())
     assert not critical_by_what_they_gave(found, "late")
+    assert critical_by_what_they_gave(found, "hit")
+    assert [given(f"no; the run gave {text}") for text in ("much", "[1]", '{"a": "x"}')] == [{}, {}, {}]
 
 
 def critical_by_what_they_gave(found: sbt.Result, metric: str) -> bool:

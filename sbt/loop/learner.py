@@ -132,10 +132,11 @@ class Learner:
 
     def _helping(self, training: History) -> EarlierRuns | None:
         """Return the earlier runs where these are predicted no worse with them."""
+        if self.earlier is None:
+            return None
         u, y = self.inputs(self.scenario.space.to_unit(training.x)), self.scenario.requirement.values(training)
         rng = stream(self.seed, "earlier", len(training))
-        critical = self.scenario.requirement.critical
-        return self.earlier if self.earlier is not None and self.earlier.helps(u, y, critical, rng) else None
+        return self.earlier if self.earlier.helps(u, y, self.scenario.requirement.critical, rng) else None
 
     def over_traffic(self, predictor: Predictor, history: History) -> tuple[Predictor, str | None]:
         """Return a predictor with P(critical) as the mean over traffic, and what a record keeps of it; or itself, None."""

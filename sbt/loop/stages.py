@@ -161,14 +161,14 @@ def sentences_of(conclusion: Conclusion, facts: Facts) -> list[str]:
 
 def _violating(facts: Facts) -> list[int]:
     """Return the indices of failed runs that are critical by the metrics which they gave."""
-    found = []
-    for row in np.flatnonzero(~facts.history.ok).tolist():
-        metrics = given(str(facts.history.columns["reason"][row]))
-        values = np.array([[metrics.get(part.metric, np.nan) for part in facts.requirement.parts]])
-        critical = facts.requirement.critical
-        if metrics and bool(critical.contains(values if facts.requirement.combined else values[:, 0])[0]):
-            found.append(int(facts.history.index[row]))
-    return found
+    lost = facts.history.where(~facts.history.ok)
+    gave = [given(str(reason)) for reason in lost.reason]
+    some = np.flatnonzero([bool(metrics) for metrics in gave])
+    y = np.array([[gave[k].get(part.metric, np.nan) for part in facts.requirement.parts] for k in some])
+    if not len(some):
+        return []
+    critical = facts.requirement.critical.contains(y if facts.requirement.combined else y[:, 0])
+    return [int(index) for index in lost.index[some[critical]]]
 
 
 def notes_of(scenario: LogicalScenario) -> tuple[str, ...]:

@@ -38,11 +38,12 @@ def given(reason: str) -> dict[str, float]:
     >>> given(with_given("metric pet must be finite, inf or -inf, but got nan", {"collision": 1.0}))
     {'collision': 1.0}
     """
-    try:
-        found = json.loads(reason.rpartition(_GAVE)[2]) if _GAVE in reason else {}
-    except ValueError:  # a text of somebody's own
+    if _GAVE not in reason:
         return {}
-    return {str(name): float(value) for name, value in found.items()} if isinstance(found, dict) else {}
+    try:
+        return {name: float(value) for name, value in json.loads(reason.rpartition(_GAVE)[2]).items()}
+    except (AttributeError, TypeError, ValueError):  # a text of somebody's own
+        return {}
 
 
 def reason_alone(reason: str) -> str:

@@ -302,7 +302,7 @@ def _key(learner: Learner, training: History, settings: str) -> str:
     """Return a key of all that decides a fit: the rows, the settings, the seed, the space, the version."""
     space, critical = learner.scenario.space, learner.scenario.requirement.critical
     features, kept = [name for name, _ in space.features], None if learner.traffic is None else learner.traffic.kept
-    fit = settings, learner.target_aware, learner.seed
+    fit = settings, type(learner.metamodel).__name__, learner.target_aware, learner.seed
     decisive = (*fit, repr(critical), repr(space.parameters), features, version("sumo-sbt"), kept)
     digest = hashlib.blake2b(json.dumps([str(part) for part in decisive]).encode(), digest_size=16)
     digest.update(np.ascontiguousarray(training.x).tobytes())
