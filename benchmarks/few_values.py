@@ -7,6 +7,7 @@
     python benchmarks/few_values.py steps [--seeds 4]              # boundaries of counts, rounded metrics and flags, 100 runs
     python benchmarks/few_values.py hits [--seeds 100]             # P(critical) of flags by random runs, few of them critical
     python benchmarks/few_values.py searched [--seeds 40]          # the same after a falsification of 90 runs, by `predict`
+    python benchmarks/few_values.py ends [--seeds 6]               # P(critical) of metrics that end, by 60 and 150 random runs
 
 Campaigns with the product's defaults. Combinations: how many falsifications of 100 runs meet a failure, and how many of as many
 random runs do; how many intervals of an estimation cover, and how many gates pass that should not. Estimation: error and half
@@ -282,15 +283,59 @@ def searched(seeds: range) -> Iterator[str]:
             yield f"| {first} to {last} | {len(group)} | {expected:.1f} | {share:.1f} | {loss:.3f} | {base:.3f} |"
 
 
+def rough(rng: np.random.Generator, d: int, length: float) -> Callable[[Points], Vector]:
+    """Return a random function of d inputs that bends within a length, of variance 1."""
+    waves, phase, size = rng.standard_normal((200, d)) / length, rng.uniform(0.0, 2.0 * math.pi, 200), rng.standard_normal(200)
+    return lambda u: 0.1 * np.cos(u @ waves.T + phase) @ size
+
+
+def ending(seed: int) -> Iterator[tuple[str, int, Callable[[Points], Vector], CriticalInterval]]:
+    """Yield metrics that end, their inputs and M_c: in most of them all that is critical has the last value, 0."""
+    rng = stream(seed, "ending")
+    f = [rough(rng, d, length) for d, length in ((4, 0.5), (3, 0.5), (3, 0.6), (5, 0.9))]
+    c, w, at_most = rng.random(4), rng.standard_normal(6), CriticalInterval(high=0.0)
+    shapes: list[tuple[str, int, Callable[[Points], Vector], CriticalInterval]] = [
+        ("a rough band", 4, lambda u: np.abs(f[0](u)) - 0.28, at_most),
+        ("a rough side", 3, lambda u: f[1](u) + 0.4, at_most),
+        ("a ball", 3, lambda u: np.linalg.norm(u - c[:3], axis=1) - 0.35, at_most),
+        ("two lines", 2, lambda u: 10.0 * np.abs(np.abs(u[:, 0] - 0.8) - np.abs(u[:, 1] - 0.5)) - 0.5, at_most),
+        ("a slope", 6, lambda u: (u - 0.5) @ w + 0.3 + 0.4 * np.sin(5.0 * u[:, 0]), at_most),
+        ("0 beyond the edge", 3, lambda u: 3.0 * (f[2](u) + 0.3), CriticalInterval(high=0.9)),
+        ("0 on the other side", 5, lambda u: 10.0 * (f[3](u) + 0.1), CriticalInterval(low=1.0)),
+    ]  # fmt: skip
+    for name, d, shape, critical in shapes:
+        yield name, d, lambda u, shape=shape: np.maximum(shape(u), 0.0), critical
+
+
+def ends(seeds: range) -> Iterator[str]:
+    yield "| metric | inputs | runs | critical, in % | told | wrong side | expected | log loss |"
+    for runs in (60, 150):
+        told: dict[tuple[str, int], list[list[float]]] = {}
+        for seed in seeds:
+            for name, d, metric, critical in ending(seed):
+                u, at = stream(seed, "u").random((runs, d)), stream(1, "points").random((8000, d))
+                hit = critical.contains(metric(at))
+                if min(critical.contains(metric(u)).sum(), (~critical.contains(metric(u))).sum()) < 2:
+                    continue
+                found = metamodel_for(QUICK, critical).fit(u, metric(u), stream(seed, "fit"))(at)
+                p, (log_p, log_not) = found.probability(critical), found.log_probability(critical)
+                wrong, loss = ((p > 0.5) != hit).mean(), -np.where(hit, log_p, log_not).mean()
+                row = [100.0 * hit.mean(), 100.0 * p.mean(), 100.0 * wrong, 100.0 * np.minimum(p, 1.0 - p).mean(), loss]
+                told.setdefault((name, d), []).append(row)
+        for (name, d), rows in told.items():
+            share, p, wrong, expected, loss = np.mean(rows, axis=0)
+            yield f"| {name} | {d} | {runs} | {share:.1f} | {p:.1f} | {wrong:.1f} | {expected:.1f} | {loss:.3f} |"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("combinations", "values", "estimation", "logarithms", "steps", "hits", "searched"))
-    parser.add_argument("--seeds", type=int, default=8)
-    given = parser.parse_args()
     tables = {
         "combinations": combinations, "values": values, "estimation": estimation, "logarithms": logarithms, "steps": steps,
-        "hits": hits, "searched": searched,
+        "hits": hits, "searched": searched, "ends": ends,
     }  # fmt: skip
+    parser.add_argument("what", choices=tuple(tables))
+    parser.add_argument("--seeds", type=int, default=8)
+    given = parser.parse_args()
     rows = tables[given.what](range(given.seeds))
     for k, row in enumerate(rows):
         print(row, flush=True)

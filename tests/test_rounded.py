@@ -13,7 +13,7 @@ from sbt.metamodels import persistence
 from sbt.metamodels.automatic import Auto
 from sbt.metamodels.base import Predictor, sample_paths
 from sbt.metamodels.ended import ended
-from sbt.metamodels.expectation_propagation import Hyper, Priors, _log_posterior, log_probability
+from sbt.metamodels.expectation_propagation import Hyper, Priors, _log_posterior, believe, log_probability
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.rounded import RoundedPredictor, rounding
 from sbt.metamodels.saturation import Opened
@@ -184,3 +184,41 @@ def test_ranges_are_learned_in_the_unit_in_which_they_are_likeliest():
         p = Opened(QUICK, critical).fit(u, y, stream(1, "fit"))(new).probability(critical)
         wrong.append(float(((p > 0.5) != truth).mean()))
     assert np.mean(wrong) < 0.01
+
+
+def test_rows_that_are_measured_have_the_evidence_of_a_process():
+    u = stream(1, "measured").random((30, 2))
+    y, hyper = np.sin(4.0 * u[:, 0]) + u[:, 1], Hyper(np.array([0.5, 0.7]), 1.2, 0.3, 0.03)
+    k = hyper.covariance(u)[0] + hyper.noise**2 * np.eye(30)
+    found, inverse, rest = believe(hyper, hyper.covariance(u)[0], y, y), np.linalg.inv(k), y - hyper.mean
+    evidence = -0.5 * rest @ inverse @ rest - 0.5 * np.linalg.slogdet(2.0 * math.pi * k)[1]
+    assert found.log_evidence == pytest.approx(evidence)
+    assert found.beside == pytest.approx(rest - inverse @ rest / np.diag(inverse))
+    assert found.wide == pytest.approx(1.0 / np.diag(inverse) - hyper.noise**2)
+
+
+def test_the_slope_of_the_evidence_is_that_where_some_rows_end():
+    u = stream(1, "ends").random((40, 2))
+    y = np.maximum(np.sin(4.0 * u[:, 0]) + u[:, 1] - 0.8, 0.0)
+    low, priors = np.where(y == 0.0, -np.inf, y), Priors((0.0, 1.0), (0.0, 1.0), (0.0, 2.0), (math.log(0.01), 2.0), ())
+    theta = Hyper(np.array([0.4, 0.6]), 1.2, 0.3, 0.03).theta
+    told = _log_posterior(theta, u, low, y, priors, None)[1]
+    ends = [[_log_posterior(theta + sign * s, u, low, y, priors, None)[0] for sign in (1e-4, -1e-4)] for s in np.eye(5)]
+    assert told == pytest.approx([(up - down) / 2e-4 for up, down in ends], abs=0.05)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_metric_that_ends_is_learned_from_few_runs_of_many_inputs(seed: int):
+    """A distance that is 0 in every collision, of six inputs: values moved beyond the end were taken for a jump."""
+    critical, (u, new) = CriticalInterval(high=0.0), (stream(seed, "u").random((60, 6)), stream(1, "new").random((4000, 6)))
+    way = stream(seed, "way").standard_normal(6)
+
+    def distance(u: Points) -> Vector:
+        return np.asarray(np.maximum((u - 0.5) @ way + 0.3 + 0.4 * np.sin(5.0 * u[:, 0]), 0.0))
+
+    predictor = Opened(QUICK, critical).fit(u, distance(u), stream(1, "fit"))
+    p, told = predictor(new).probability(critical), ended(predictor(new))
+    assert ((p > 0.5) != (distance(new) == 0.0)).mean() < 0.01
+    assert np.minimum(p, 1.0 - p).mean() < 0.01
+    assert np.abs(told.mu - distance(new)).max() < 0.5
+    assert (told.mu >= 0.0).all()

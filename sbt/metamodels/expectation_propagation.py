@@ -1,7 +1,8 @@
 """A latent Gaussian process of which each row tells an interval: a label its sign, a rounded value what it was rounded from.
 
 Rows are told by intervals of the latent function with a Gaussian noise on it; expectation propagation finds the Gaussian for each
-of them that stands for what it says, all at once, and with it the evidence, whose gradient is written down.
+of them that stands for what it says, all at once, and with it the evidence, whose gradient is written down. A row whose interval
+has no width is what was measured: its Gaussian is known.
 """
 
 from __future__ import annotations
@@ -130,28 +131,40 @@ def believe(
     hyper: Hyper, covariance: Points, low: Vector, high: Vector, start: tuple[Vector, Vector] | None = None
 ) -> Belief:  # fmt: skip
     """Return what expectation propagation believes, all rows at once, from the Gaussians of another belief on."""
-    precision, shift = (np.zeros(len(low)), np.zeros(len(low))) if start is None else start
+    m, exact = len(low), low == high
+    precision, shift = (np.zeros(m), np.zeros(m)) if start is None else start
+    precision = np.where(exact, hyper.noise**-2.0, precision)
+    shift = np.where(exact, (np.where(exact, low, 0.0) - hyper.mean) * precision, shift)
+    k = np.flatnonzero(~exact) if exact.any() else slice(None)
     before = math.inf
-    for k in range(_SWEEPS):
+    for sweep in range(_SWEEPS):
         lower, pull, middle, variance = _solved(covariance, precision, shift)
         rest = 1.0 / variance - precision  # without the row
         lost = rest < _LEAST_REST / variance  # what is left of it is rounding
         rest = np.where(lost, _LEAST_REST / variance, rest)
         beside = np.where(lost, middle, (middle / variance - shift) / rest)
-        log_z, up, bent, by_noise = _moments(low - hyper.mean - beside, high - hyper.mean - beside, 1.0 / rest, hyper.noise)
+        r, b, p, s = rest[k], beside[k], precision[k], shift[k]
+        log_z, up, bent, by_noise = _moments(low[k] - hyper.mean - b, high[k] - hyper.mean - b, 1.0 / r, hyper.noise)
         log_evidence = (
-            float(log_z.sum() + 0.5 * np.log1p(precision / rest).sum() - np.log(np.diag(lower)).sum())
-            + 0.5 * float((shift * middle).sum() - (shift**2 / (rest + precision)).sum())
-            + 0.5 * float((beside * rest * (precision * beside - 2.0 * shift) / (rest + precision)).sum())
+            float(log_z.sum() + 0.5 * np.log1p(p / r).sum() - np.log(np.diag(lower)).sum())
+            + 0.5 * float((s * middle[k]).sum() - (s**2 / (r + p)).sum())
+            + 0.5 * float((b * r * (p * b - 2.0 * s) / (r + p)).sum())
+            + _evidence_of_exact(precision[exact], shift[exact], middle[exact])
         )
-        if abs(log_evidence - before) < _CLOSE or k == _SWEEPS - 1:
+        if abs(log_evidence - before) < _CLOSE or sweep == _SWEEPS - 1:
             break  # factor and Gaussians belong together
-        before, about = log_evidence, beside + up / rest
-        narrowed = np.maximum(1.0 / rest - bent / rest**2, 1e-12)
-        found, aim = np.maximum(1.0 / narrowed - rest, 1e-10), about / narrowed - beside * rest
-        damped = 1.0 if k < 3 else _DAMPED
-        precision, shift = precision + damped * (found - precision), shift + damped * (aim - shift)
+        before, about = log_evidence, b + up / r
+        narrowed = np.maximum(1.0 / r - bent / r**2, 1e-12)
+        found, aim = np.maximum(1.0 / narrowed - r, 1e-10), about / narrowed - b * r
+        damped = 1.0 if sweep < 3 else _DAMPED
+        precision, shift = precision.copy(), shift.copy()
+        precision[k], shift[k] = p + damped * (found - p), s + damped * (aim - s)
     return Belief(precision, shift, pull, lower, log_evidence, beside, 1.0 / rest, float(by_noise.sum()))
+
+
+def _evidence_of_exact(precision: Vector, shift: Vector, middle: Vector) -> float:
+    """Return what rows add to the log evidence whose values are measured, with noise; `middle`: the mean that is believed."""
+    return 0.5 * float((np.log(precision) - 2.0 * _LOG_ROOT + shift * (middle - shift / precision)).sum())
 
 
 def log_probability(low: Vector, high: Vector) -> Vector:
@@ -232,5 +245,7 @@ def _log_posterior(
     prior, slopes = priors.log_density(theta)
     for k in range(d):
         slopes[k] += float((weight * falling * ((u[:, k, None] - u[None, :, k]) / hyper.lengths[k]) ** 2).sum())
-    slopes[d:] += 2.0 * float((weight * covariance).sum()), float(belief.pull.sum()), belief.by_noise
+    exact = low == high
+    by_noise = belief.by_noise + 2.0 * hyper.noise**2 * float(np.diag(weight)[exact].sum())
+    slopes[d:] += 2.0 * float((weight * covariance).sum()), float(belief.pull.sum()), by_noise
     return belief.log_evidence + prior, slopes, belief

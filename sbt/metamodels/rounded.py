@@ -1,8 +1,8 @@
-"""A process of what a metric was rounded from: a count, a time in steps of the simulation, a level of severity.
+"""A process of what a metric was rounded from, as a count or a level of severity was, or goes on as where it ends.
 
 Of such a metric a run tells between which two numbers it lay. Least squares take the steps for noise, so that P(critical) is
 vague next to runs that leave no doubt, or for the shape itself, and are surest where a step goes on. Here each run tells its
-range.
+range. So does a run that ended at the end of a metric, as a distance of 0 is in every collision: it lay there or beyond.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
 from sbt.metamodels.base import Metamodel, gives_different
+from sbt.metamodels.censored import Limit
 from sbt.metamodels.expectation_propagation import Belief, Hyper, Priors, believe, fitted, latent, latent_paths
 from sbt.metamodels.prediction import Prediction
 from sbt.metamodels.stacking import surely_positive
@@ -24,7 +25,8 @@ from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
 __all__ = [
-    "RoundedPredictor", "Rounding", "StepAware", "better_rounded", "rounded_process", "rounding", "two_ranges", "without_unit",
+    "RoundedPredictor", "Rounding", "StepAware", "better_rounded", "beyond_ranges", "rounded_process", "rounding", "two_ranges",
+    "without_unit",
 ]  # fmt: skip
 
 _FEWEST, _TIED = 10, 0.5
@@ -52,7 +54,7 @@ class Rounding:
     Args:
         low, high: (n,) ends of the range that each value stands for; infinite ones of the first and the last value.
         edge: between the ranges of what is critical and what is not.
-        width: > 0, of the step at the edge.
+        width: > 0, of the step at the edge; 0: of a metric that ends somewhere, of which other rows tell exactly what it is.
     """
 
     low: Vector
@@ -104,6 +106,22 @@ def rounding(u: Points, y: Vector, critical: CriticalInterval) -> Rounding | Non
         edge, width = float(middle[k]), float(values[k + 1] - values[k])
     low[0], high[-1] = -np.inf, np.inf
     return Rounding(low[which], high[which], edge, width)
+
+
+def beyond_ranges(y: Vector, limit: Limit | None, moved: Mask, critical: CriticalInterval) -> Rounding | None:
+    """Return what y (n,) tells of a metric that goes on beyond its end, where some of the runs were moved; None: it has no end.
+
+    Args:
+        y: (n,) the metric.
+        limit: what is known of the k runs that were moved, in their order.
+        moved: (n,) which these are.
+        critical: M_c.
+    """
+    if limit is None or not critical.one_sided or not _FEWEST <= len(y) <= _MOST:
+        return None
+    low, high = np.array(y), np.array(y)
+    low[moved], high[moved] = np.where(limit.at_most, -np.inf, y[moved]), np.where(limit.at_most, y[moved], np.inf)
+    return Rounding(low, high, critical.edge, 0.0)
 
 
 def two_ranges(y: Vector) -> Rounding:
@@ -247,6 +265,8 @@ def without_unit(
     """
     if warp is None or not np.std(y) > 0.0:
         return True
+    if told.width == 0.0:
+        return False
     few = _some(np.argsort(np.abs(y - critical.edge), kind="stable"), _LEARNED, rng)
     plain = _learned(told, critical, u, y, None, few)[1]
     return plain >= _learned(told, warp.interval(critical), u, warp.values(y), warp, few)[1]

@@ -19,7 +19,7 @@ from scipy.special import log_ndtr
 from sbt.metamodels.base import Metamodel, Predictor, Screened, fitted, is_flag, sample_paths, sketched, with_target
 from sbt.metamodels.censored import Limit, beyond
 from sbt.metamodels.prediction import Prediction, Scale, reached_beyond
-from sbt.metamodels.rounded import StepAware, rounding
+from sbt.metamodels.rounded import StepAware, beyond_ranges, rounding
 from sbt.metamodels.warp import Warp, gap_of
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.combination import MARGIN
@@ -307,7 +307,7 @@ class Opened:
         critical = as_passed(self.critical, y)
         if self.beyond:
             metamodel, (learned, limit) = with_target(self.metamodel, critical), opened_and_limit(u, y, critical, rng)
-            told = rounding(u, y, critical)
+            told = rounding(u, y, critical) or beyond_ranges(y, limit, learned != y, critical)
             metamodel = metamodel.with_rounding(told) if told is not None and isinstance(metamodel, StepAware) else metamodel
         else:
             metamodel, learned, limit = self.metamodel, centred(u, y, critical), None
