@@ -247,3 +247,48 @@ def test_an_unchanged_question_to_random_draws_has_their_exact_interval(crude):
     assert (found := crude.estimate()).probability > 0.0
     told = crude.conclusion
     assert (found.probability, found.low, found.high) == pytest.approx((told.probability, told.low, told.high), rel=1e-9)
+
+
+@pytest.mark.parametrize("late", [150, 185])
+def test_asking_again_knows_what_the_metamodel_denied(tmp_path: Path, late: int):
+    """One run of a smooth metric is critical by its seed, far from where others are: before, or after the last that counts."""
+    calls = iter(range(1, 10_000))
+
+    def evaluate(values: dict[str, Any], seed: int) -> dict[str, float]:
+        return {"ttc": 0.0 if next(calls) == late else 3.5 - values["a"]}
+
+    inputs = [sbt.Parameter("a", -5, 5, "m", sbt.Normal(0, 1)), sbt.Parameter("c", 0, 1, "m")]
+    scenario = sbt.Scenario("late", inputs, sbt.Requirement("ttc", high=0.5), evaluate=evaluate)
+    result = sbt.run(
+        campaign="estimation", scenario=scenario, budget=200, seed=1, gate={"probability": 0.003}, executor="serial",
+        report=False, store=tmp_path / "store",
+    )  # fmt: skip
+    told, again = result.conclusion, result.estimate()
+    denied = [text for text in told.warnings if "denied" in text]
+    assert late == 150 or len(denied) == 2
+    assert len([text for text in again.warnings if "denied" in text]) == len(denied)
+    assert again.undetected_mass_bound == pytest.approx(told.undetected_mass_bound, rel=1e-6)
+    assert again.high > 0.9 * told.high
+    wider = result.estimate(critical=(-np.inf, 1.0))  # what is critical by it was not denied: it was not asked for
+    assert wider.undetected_mass_bound == pytest.approx(told.undetected_mass_bound, rel=1e-6)
+
+
+def test_each_requirement_knows_what_the_metamodel_denied(tmp_path: Path):
+    calls = iter(range(1, 10_000))
+
+    def evaluate(values: dict[str, Any], seed: int) -> dict[str, float]:
+        return {"ttc": 0.0 if next(calls) == 185 else 3.5 - values["a"], "gap": 3.3 - values["c"]}
+
+    inputs = [sbt.Parameter("a", -5, 5, "m", sbt.Normal(0, 1)), sbt.Parameter("c", -5, 5, "m", sbt.Normal(0, 1))]
+    need = sbt.any_of(sbt.Requirement("ttc", high=0.5), sbt.Requirement("gap", high=0.5))
+    result = sbt.run(
+        campaign="estimation", scenario=sbt.Scenario("late", inputs, need, evaluate=evaluate), budget=200, seed=1,
+        gate={"probability": 0.006}, executor="serial", report=False, store=tmp_path / "store",
+    )  # fmt: skip
+    told = result.conclusion
+    assert any("after the last one that counts" in text for text in told.warnings)
+    ttc, gap = told.requirements
+    assert ttc.high > 0.9 * told.high  # it was violated where that was denied
+    assert gap.high < 0.01
+    assert result.estimate(metric="ttc").high > 0.9 * told.high
+    assert result.estimate(metric="gap").high < 0.01

@@ -90,7 +90,7 @@ def test_an_estimate_on_warm_ups_has_their_spread(tmp_path, method):
         study = Study.from_store(store, objects={("scenarios", "object:warm"): scenario}, live=True)
         log = Log(history, tuple(store.iterations()), ())
         found, _ = study.campaign.conclude(log)
-    again = answer(reused(log, _settings(study, scenario.requirement), study.scenario.space))
+    again = answer(reused(log, _settings(study, scenario.requirement), study.scenario.space, scenario.requirement))
     assert again.warmed_traffic.warm_ups == 20
     assert again.high - again.low > 0.8 * (found.high - found.low)
     assert again.low < plain.low

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from sbt.campaigns.counting import DRAWN, NOMINAL, Seen
+from sbt.campaigns.counting import DENIED, DRAWN, NOMINAL, Seen
 from sbt.campaigns.crude import nominal_rows, took_monte_carlo
 from sbt.campaigns.known import Known
 from sbt.campaigns.pools import Frame, admitted, most_nominal, sample_mixture
@@ -30,6 +30,7 @@ from sbt.estimators.surrogate import Coordinates, LogProbability
 from sbt.loop.stages import Log
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.cells import MOST_GIVEN, MOST_JOINED
+from sbt.problem.requirement import Requirement
 from sbt.problem.sensitivity import drawn_between, outside
 from sbt.problem.space import ParameterSpace
 from sbt.seeds import stream
@@ -72,6 +73,8 @@ class Reused:
         met: of all draws from the campaign's distribution, those that were critical or failed.
         known: different inputs of critical runs.
         unviolated: requirements that no run violated.
+        surprises: of these draws, critical ones that a metamodel had denied.
+        late: one of them came after the last batch that counts.
     """
 
     space: ParameterSpace
@@ -89,6 +92,8 @@ class Reused:
     met: int = 0
     known: int = 0
     unviolated: Unviolated = field(default_factory=Unviolated)
+    surprises: int = 0
+    late: bool = False
 
     @property
     def unmet(self) -> Vector:
@@ -96,13 +101,14 @@ class Reused:
         return np.concatenate([self.nominal, np.ones(self.taught)])
 
 
-def reused(log: Log, settings: Settings, space: ParameterSpace) -> Reused:
+def reused(log: Log, settings: Settings, space: ParameterSpace, own: Requirement) -> Reused:
     """Return the counted draws of a campaign, with weights for the distribution of `space`.
 
     Args:
         log: of the campaign.
         settings: of the campaign, its scenario with the requirement that is asked for.
         space: the same inputs with the distribution that is asked for.
+        own: the campaign's requirement.
 
     Raises:
         InputError: no draw has a known density, the new distribution has mass where the old has none, or the runs did not
@@ -130,14 +136,16 @@ def reused(log: Log, settings: Settings, space: ParameterSpace) -> Reused:
         tuple(_batch(history, space, outcomes, d.rows, said[k]) for d, said in zip(draws, predicted, strict=True))
         for k, outcomes in enumerate((hits, hits | ~history.ok))
     )
-    nominal, seen = np.concatenate([1.0 * (np.arange(len(d.rows)) < d.nominal) for d in draws]), Seen.of(log, settings)
+    nominal = np.concatenate([1.0 * (np.arange(len(d.rows)) < d.nominal) for d in draws])
+    seen, others = Seen.of(log, settings, own), hits[every] & ~own.critical_runs(history)[every] & (nominal > 0.0)
+    denied = np.concatenate([np.full(len(d.rows), said[0].denied) for d, said in zip(draws, predicted, strict=True)])
     return Reused(
         space, batches, worst, int((~history.ok[every]).sum()), nominal,
         np.exp(space.log_density(x) - old.log_density(x)), crude,
         int((hits & reached).sum()), int((history.ok & ~hits & reached).sum()),
         history.columns["warm_up"][every], least,
         seen.draws - round(float(nominal.sum())) if not plainly else 0, seen.hits + seen.failed, seen.known,
-        Unviolated.of(history, settings),
+        Unviolated.of(history, settings), seen.surprises + int((others & denied).sum()), seen.surprised > draws[-1].number >= 0,
     )  # fmt: skip
 
 
@@ -166,6 +174,11 @@ class _Said:
 
     at_draws: Vector | None = None
     pool: Predicted | None = None
+
+    @property
+    def denied(self) -> Mask | bool:
+        """(n,) which draws would be surprises if they were critical; False: there is no metamodel."""
+        return False if self.at_draws is None else self.at_draws < DENIED
 
 
 _NOTHING_SAID = _Said()

@@ -11,6 +11,7 @@ from sbt.campaigns.clustering import spread_of_batches
 from sbt.campaigns.counting import FEW_KNOWN
 from sbt.campaigns.estimation import Concluded, EstimationConclusion, on_warm_ups
 from sbt.campaigns.gate import Limits
+from sbt.campaigns.precision import cautions
 from sbt.campaigns.wording import plural
 from sbt.estimators.intervals import FEW_HITS, CountedBatch, combine_estimates
 from sbt.estimators.reweighting import ReusedBatch, WeightedShare, defended_bound, effective_size
@@ -73,7 +74,7 @@ def _from_batches(found: Reused) -> Concluded:
     low, high = combine_estimates(safe), combine_estimates(worst)
     hits, perhaps, misses = sum(b.hits for b in safe), sum(b.hits for b in worst), sum(b.misses for b in worst)
     not_hits = sum(b.misses for b in safe)
-    missed = defended_bound(0, found.unmet, found.ratio, _CONFIDENCE)
+    missed = defended_bound(found.surprises, found.unmet, found.ratio, _CONFIDENCE)
 
     def bound(count: int, confidence: float) -> float:
         return defended_bound(count, found.nominal, found.ratio, confidence)
@@ -99,12 +100,17 @@ def _from_batches(found: Reused) -> Concluded:
     elif few_low or few_high:
         met = f"{plural(hits, 'counted draw')} critical" if hits < FEW_HITS else f"{plural(misses, 'counted draw')} safe"
         warnings.append(f"only {met}, fewer than {FEW_HITS}: the interval is that of so small a number")
+    if found.late and hits and misses:
+        limits = limits.reaching(lambda c: defended_bound(found.met, found.unmet, found.ratio, c))
+        at_least = f"the upper end is at least that of {_draws_words(found)}"
+        warnings.append(f"a draw after the last one that counts was critical where the metamodel denied it: {at_least}")
     if found.critical:
         def alone(c: float) -> float:
             return defended_bound(found.failed, found.unmet, found.ratio, c)
 
         limits = found.unviolated.reached(limits, alone, lambda c: defended_bound(found.met, found.unmet, found.ratio, c))
         warnings += found.unviolated.sentences(_draws_words(found), alone(0.5 * (1.0 + _CONFIDENCE)))
+    warnings += cautions(len(safe), low.largest_term, value, found.surprises)
     return _conclusion(value, limits, low.std_error, max(min(max(high.value, 0.0), 1.0), value), hits, missed, exact, warnings)
 
 

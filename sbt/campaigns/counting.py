@@ -24,7 +24,7 @@ from sbt.store.history import History
 from sbt.store.records import Iteration
 
 __all__ = [
-    "DRAWN", "FEW_KNOWN", "LEARNED", "NOMINAL", "RANDOM", "Seen", "counted_batches", "counted_iterations", "crude_rows",
+    "DENIED", "DRAWN", "FEW_KNOWN", "LEARNED", "NOMINAL", "RANDOM", "Seen", "counted_batches", "counted_iterations", "crude_rows",
     "denied_by_draws", "hardly_known", "held", "random_draws", "with_event",
 ]  # fmt: skip
 
@@ -39,7 +39,7 @@ LEARNED = "learn"
 FEW_KNOWN = 10
 """Inputs of critical runs, below which the size of their region was a guess: 4 of 30 intervals lay below a P of .02 that 150 runs
 beside a plateau had met 3 to 10 times. The exact limit of random draws holds whatever the metamodel makes of them."""
-_DENIED = 0.01
+DENIED = 0.01
 """P(critical) below which a critical draw is a surprise to the metamodel."""
 _HARDLY = 0.5
 """Coefficient of variation above which the limits of an estimate are no wider than those of random draws."""
@@ -115,7 +115,7 @@ def counted_iterations(log: Log) -> list[int]:
 
 def _denied(proposal: EstimationProposal) -> float:
     """Return the P(critical) below which a critical draw is a surprise; beside other drivers much less than the mean is none."""
-    return _DENIED * (proposal.pool.probability if proposal.pairs is not None and proposal.pool is not None else 1.0)
+    return DENIED * (proposal.pool.probability if proposal.pairs is not None and proposal.pool is not None else 1.0)
 
 
 @dataclass(frozen=True)
@@ -150,10 +150,14 @@ class Seen:
         return replace(self, failed=self.failed - self.failed_apart, failed_apart=0)
 
     @classmethod
-    def of(cls, log: Log, settings: Settings) -> Seen:
-        """Count the runs of a log."""
+    def of(cls, log: Log, settings: Settings, required: Requirement | None = None) -> Seen:
+        """Count the runs of a log; `required`: by the campaign, where the requirement of the settings is asked for afterwards.
+
+        A surprise is critical by both then: what the metamodel said is of its own.
+        """
         history = log.history
         critical = settings.scenario.requirement.critical_runs(history)
+        told = critical if required is None else critical & required.critical_runs(history)
         drawn = np.isin(history.stage, (DRAWN, LEARNED))
         plain = np.flatnonzero(np.isin(history.stage, (NOMINAL, RANDOM)))  # until values came that can be followed
         rows, surprising, surprised = [plain], [np.zeros(len(plain), dtype=np.bool_)], -1
@@ -166,11 +170,11 @@ class Seen:
                 first = first[own]
                 rows.append(first)
                 surprising.append(np.array(nominal.pi)[own] < _denied(proposal))
-                surprised = batch.number if (critical[first] & surprising[-1]).any() else surprised
+                surprised = batch.number if (told[first] & surprising[-1]).any() else surprised
         mine, denied = np.concatenate(rows), np.concatenate(surprising)
         return cls(
             int(critical.sum()), int((history.ok & ~critical).sum()), len(mine), int(critical[mine].sum()),
-            int((~history.ok[mine]).sum()), int((critical[mine] & denied).sum()),
+            int((~history.ok[mine]).sum()), int((told[mine] & denied).sum()),
             _known(settings.scenario.requirement, history), surprised, int((~history.ok & (history.stage != DRAWN))[mine].sum()),
         )  # fmt: skip
 

@@ -104,7 +104,8 @@ def _from_batches(log: Log, settings: Settings, confidence: float) -> tuple[Requ
         else:
             ends = _ends(spread_of_draws(log, safe, critical), value, low, high, few=few, confidence=tail)
             seen = _seen(part, log, settings)
-            ends = ends[0], max(ends[1], seen.most_critical(tail)) if seen.known < FEW_KNOWN else ends[1]
+            reaches = seen.known < FEW_KNOWN or seen.surprised > counted_iterations(log)[-1]
+            ends = ends[0], max(ends[1], seen.most_critical(tail)) if reaches else ends[1]
         found.append(RequirementEstimate(part.label, value, min(ends[0], value), max(ends[1], value), hits))
     return tuple(found)
 
@@ -126,8 +127,9 @@ def _bounds(part: Requirement, log: Log, settings: Settings, confidence: float) 
 
 
 def _seen(part: Requirement, log: Log, settings: Settings) -> Seen:
-    """Return what the runs met of one requirement."""
-    return Seen.of(log, replace(settings, scenario=replace(settings.scenario, requirement=part)))
+    """Return what the runs met of one requirement; what the metamodel denied is known of the combination."""
+    one = replace(settings, scenario=replace(settings.scenario, requirement=part))
+    return Seen.of(log, one, settings.scenario.requirement)
 
 
 def _batches_of(k: int, part: Requirement, log: Log, settings: Settings, *, failed_critical: bool) -> list[CountedBatch]:

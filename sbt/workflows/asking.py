@@ -83,7 +83,7 @@ def estimate_again(
     requirement = _requirement(scenario.requirement, metric, critical)
     space = asked_space(inputs or {}, scenario.space)
     settings = _settings(study, requirement)
-    found = reused(log, settings, space)
+    found = reused(log, settings, space, scenario.requirement)
     if took_sum(log):
         said, limits = conclude_sum(log, replace(settings, scenario=replace(settings.scenario, space=space)))
         said, _ = on_warm_ups(said, limits, warmed_traffic(log, settings))
@@ -95,7 +95,8 @@ def estimate_again(
 def sensitivities_in(study: Study, log: Log) -> tuple[Sensitivity, ...]:
     """Return the sensitivities of an estimation to the parameters of its own distributions; none where nothing counts."""
     try:
-        return sensitivities(reused(log, _settings(study, study.scenario.requirement), study.scenario.space))
+        own = study.scenario.requirement
+        return sensitivities(reused(log, _settings(study, own), study.scenario.space, own))
     except InputError:
         return ()
 
