@@ -400,6 +400,19 @@ def test_a_table_of_recorded_runs_with_choices_comes_back(tmp_path):
     assert table.run(first.inputs, 0)["m"] == pytest.approx(first.metrics["m"])
 
 
+def test_choices_that_mean_nothing_to_others_come_back_from_a_table(tmp_path):
+    from sbt.store.tables import from_folder
+
+    inputs = [sbt.Parameter("k", choices=["1", "03", "NA", "null", "nan"]), sbt.Parameter("v", 0, 1)]
+    plain = sbt.Scenario("na", inputs, sbt.Requirement("m", high=0.5), evaluate=lambda values, _: {"m": values["v"]})
+    done = sbt.run(
+        campaign="coverage", scenario=plain, budget=30, seed=1, store=tmp_path / "s", executor="serial", report=False
+    )  # fmt: skip
+    table = from_folder(str(done.export("dsiod").parent), tmp_path)
+    assert sorted(table.pool.x[:, 0]) == sorted(done.history.x[:, 0])
+    assert len(set(table.pool.x[:, 0])) == 5
+
+
 @pytest.mark.parametrize("form", ["text", "xml"])
 def test_placeholders_take_choices_as_text_escaped_and_formulas_compare(tmp_path, form):
     values = {"kind": "Fish & \"Chips\" 'n' é", "v": 10.0}

@@ -70,13 +70,19 @@ class Expression:
                     raise InputError(f"a constant in '{self.text}' must be finite, but got {ast.unparse(node)}")
 
     def _tree(self) -> ast.expr:
+        text = self.text.strip()
         try:
-            return ast.parse(self.text.strip(), mode="eval").body
+            tree = ast.parse(text, mode="eval").body
         except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
             reason = getattr(error, "msg", None) or str(error) or "nested too deeply"
             words = [word for word in re.findall(r"[A-Za-z_]\w*", self.text) if keyword.iskeyword(word) and word not in _WORDS]
             reason = f"'{words[0]}' is a word of Python, and no name for an input of a formula" if words else reason
             raise InputError(f"an expression must be a formula, but got '{self.text}' ({reason})") from None
+        if not text.isascii():
+            for node in ast.walk(tree):
+                if isinstance(node, ast.Name):  # Python takes the micro sign for a Greek letter, an input's name has it
+                    node.id = ast.get_source_segment(text, node) or node.id
+        return tree
 
     def names(self) -> tuple[str, ...]:
         """Return the inputs that the formula uses, in order of appearance."""

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sbt.errors import InputError, RunError
+from sbt.files import write_atomically
 from sbt.problem.arrays import Vector
 from sbt.problem.distribution import Distribution
 from sbt.problem.outcome import Status
@@ -169,14 +170,13 @@ def to_folder(
         **({} if spread_evenly and not scenario.uneven else {"spread_evenly": False}),
     }  # fmt: skip
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / "config.yml").open("w", encoding="utf-8") as file:
-        YAML().dump(described, file)
+    write_atomically(folder / "config.yml", lambda part: YAML().dump(described, part))
     columns = named_columns(done.x, done.names, done.choices) | {name: done.y(name) for name in done.metrics}
     columns = columns | ({} if _SEED in columns else {_SEED: done.seed})
     path = folder / f"runs{suffix}"
     frame = pd.DataFrame(columns)
-    frame.to_csv(path, index=False) if suffix == ".csv" else frame.to_parquet(path, index=False)
-    return path
+    write = frame.to_csv if suffix == ".csv" else frame.to_parquet
+    return write_atomically(path, lambda part: write(part, index=False))
 
 
 def _table_of(path: Path) -> Path:
@@ -221,9 +221,11 @@ def _read(path: Path, choices: Mapping[str, Iterable[str]]) -> dict[str, Any]:
     """Return the columns as float64, choices as their positions."""
     import pandas as pd
 
-    texts: Any = dict.fromkeys(choices, str)  # as converters, which take "NA" and "1" for what they are
     try:
-        frame = pd.read_csv(path, converters=texts) if path.suffix == ".csv" else pd.read_parquet(path)
+        frame = pd.read_csv(path) if path.suffix == ".csv" else pd.read_parquet(path)
+        if path.suffix == ".csv" and choices:  # of which "NA" and "1" are what they are
+            texts = pd.read_csv(path, usecols=lambda name: name in choices, dtype=str, keep_default_na=False)
+            frame = frame.assign(**texts)
     except ImportError:
         raise InputError(f"{path.name} needs pyarrow (pip install 'sumo-sbt[parquet]'); or save it as csv") from None
     except Exception as error:  # pandas and pyarrow raise whatever they like about a broken file
