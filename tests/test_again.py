@@ -249,7 +249,7 @@ def test_an_unchanged_question_to_random_draws_has_their_exact_interval(crude):
     assert (found.probability, found.low, found.high) == pytest.approx((told.probability, told.low, told.high), rel=1e-9)
 
 
-@pytest.mark.parametrize("late", [150, 185])
+@pytest.mark.parametrize("late", [pytest.param(150, marks=pytest.mark.slow), 185])
 def test_asking_again_knows_what_the_metamodel_denied(tmp_path: Path, late: int):
     """One run of a smooth metric is critical by its seed, far from where others are: before, or after the last that counts."""
     calls = iter(range(1, 10_000))

@@ -331,6 +331,7 @@ SCENARIO = sbt.Scenario("cone", [sbt.Parameter(n, 0, 1) for n in "abc"], sbt.Req
 """
 
 
+@pytest.mark.slow
 def test_does_not_stop_while_few_runs_tell_of_a_side(tmp_path: Path):
     """2.3 % is critical: four of nine campaigns ended after 40 runs without a critical one, with as much on the wrong side."""
     (tmp_path / "cone.py").write_text(CONE)

@@ -52,6 +52,7 @@ def test_a_known_probability(tmp_path):
     assert found["undetected_mass_bound"] < 0.4  # 3 over the draws from the inputs' distribution, those that only teach too
 
 
+@pytest.mark.slow
 def test_large_batches_leave_some_to_learn_from(tmp_path):
     """A single batch counted, drawn by what a search had learned: errors of a sixth, and a fifth of the intervals missed."""
     p = float(ndtr(-2.0 - 0.3 * np.sin(5.0 * (np.arange(5000) + 0.5) / 5000)).mean())
@@ -204,6 +205,7 @@ def _campaigns(scenario: sbt.Scenario, folder: Path, seeds: int | range, budget:
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_many_inputs_are_no_worse_than_crude_monte_carlo(tmp_path):
     """Subset simulation stated nothing in 14 of 50 such campaigns, had twice the error in the others, and stopped early."""
     p, budget = 0.02, 300

@@ -426,6 +426,7 @@ def _repeats(n: int, margin, seed: int, most: int = 10**6) -> list[SubsetRun]:
     return repeats
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("margin", "p"),
     [

@@ -102,6 +102,7 @@ def test_of_several_requirements_each_is_known_by_its_own_runs(tmp_path: Path):
     assert found.requirements[1].low <= math.pi * 0.12**2 <= found.requirements[1].high
 
 
+@pytest.mark.slow
 def test_a_requirement_that_no_run_violated_may_hold_what_its_draws_leave(tmp_path: Path):
     """The whole ended at .0063 where a part of it that no run had met ended at .12; draws lay 3,000 deviations out for it."""
 
@@ -169,6 +170,7 @@ def test_critical_runs_somewhere_do_not_stand_for_runs_that_fill_the_space(tmp_p
     assert found.expected_misclassified + 0.5 / (found.even_fraction.counted + 1.0) <= 0.02
 
 
+@pytest.mark.slow
 def test_an_estimation_beside_a_requirement_that_nothing_violates_ends_when_draws_have_bounded_that(tmp_path: Path):
     """It ended at run 165 with an upper end of 4.5 times the estimate, or never."""
     need = sbt.any_of(sbt.Requirement("near", high=0.0), sbt.Requirement("hit", low=0.5))

@@ -121,6 +121,7 @@ def test_a_boundary_of_a_coin_says_that_it_knows_nothing(tmp_path: Path):
     assert np.mean(wrong) > 0.3
 
 
+@pytest.mark.slow
 def test_where_noise_decides_the_space_is_filled(tmp_path: Path):
     """Where P was said to be small nobody looked again: of a left turn half of the critical share was stated."""
 
@@ -146,6 +147,7 @@ def test_where_noise_decides_the_space_is_filled(tmp_path: Path):
     assert filled[2][:2] == [0, 0], "likewise until edges are known"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "critical", [CriticalInterval(low=1.0), pytest.param(CriticalInterval(high=-1.0), marks=pytest.mark.slow)]
 )

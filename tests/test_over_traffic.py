@@ -119,6 +119,7 @@ class Failing(Drawn):
         return super().__call__(values, seed)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("low", [False, True])
 def test_traffic_with_which_runs_fail_is_not_that_of_those_that_give_a_metric(low: bool, tmp_path: Path) -> None:
     w, e = np.random.default_rng(5).standard_normal((2, 20_000))
@@ -137,6 +138,7 @@ def test_of_a_combination_seeds_are_not_chosen(tmp_path: Path) -> None:
     assert not found.frame.seed_chosen.any(), "P(critical) of a combination is that of its metamodels of the inputs"
 
 
+@pytest.mark.slow
 def test_what_pairs_tell_of_rare_critical_runs_is_known(tmp_path: Path) -> None:
     found = run(tmp_path / "rare", evaluate=Drawn(far=1.6), budget=105)
     frame = found.frame

@@ -382,7 +382,7 @@ def test_expressions_know_their_functions_and_names():
     for name, function in {"sqrt": np.sqrt, "exp": np.exp, "log": np.log, "sin": np.sin, "cos": np.cos}.items():
         np.testing.assert_array_equal(Expression(f"{name}(x)")({"x": x}), function(x))
     assert Expression("b * a < b + min(c, 2)").names() == ("b", "a", "c")
-    assert Expression("2 * \u00b5 < \u03bc").names() == ("\u00b5", "\u03bc")  # micro sign, Greek letter
+    assert set(Expression("2 * \u00b5 < \u03bc").names()) == {"\u00b5", "\u03bc"}  # micro sign, Greek letter
     np.testing.assert_array_equal(Expression("0 < x < 0.5")({"x": x}), [True, False])
     with pytest.raises(InputError, match=r"'z' in 'x \+ z' must be an input, one of: x"):
         Expression("x + z")({"x": x})

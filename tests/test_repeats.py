@@ -127,7 +127,12 @@ def test_critical_runs_that_stand_alone_are_repeated_until_a_repeat_differs():
     assert repeats_wanted(spent, PLANE, 5) == (), "nine critical inputs were repeated"
 
 
-@pytest.mark.parametrize("campaign", ["boundary", "estimation", "falsification"])
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize(
+    "campaign", [pytest.param("boundary", marks=SLOW), pytest.param("estimation", marks=SLOW), "falsification"]
+)  # fmt: skip
 def test_a_failure_of_one_seed_in_fifty_gives_its_noise_away(campaign: str, tmp_path: Path):
     def dropout(inputs: dict[str, float], seed: int) -> dict[str, float]:
         return {"y": -1.0 if np.random.default_rng(seed).random() < 0.02 else 0.3 + inputs["a"]}

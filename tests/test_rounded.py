@@ -134,6 +134,7 @@ def test_a_noisy_count_keeps_its_noise():
     assert np.sqrt(np.mean((p - truth) ** 2)) < 0.1
 
 
+@pytest.mark.slow
 def test_a_boundary_of_a_rounded_metric_ends_when_it_is_known(tmp_path: Path):
     inputs = [sbt.Parameter(name, 0.0, 1.0) for name in "abc"]
     scenario = sbt.Scenario(
@@ -207,7 +208,7 @@ def test_the_slope_of_the_evidence_is_that_where_some_rows_end():
     assert told == pytest.approx([(up - down) / 2e-4 for up, down in ends], abs=0.05)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)])
 def test_a_metric_that_ends_is_learned_from_few_runs_of_many_inputs(seed: int):
     """A distance that is 0 in every collision, of six inputs: values moved beyond the end were taken for a jump."""
     critical, (u, new) = CriticalInterval(high=0.0), (stream(seed, "u").random((60, 6)), stream(1, "new").random((4000, 6)))

@@ -264,6 +264,7 @@ def test_a_boundary_is_where_a_metric_ends(tmp_path):
     assert 2 * (critical & found).sum() / (critical.sum() + found.sum()) > 0.93
 
 
+@pytest.mark.slow
 def test_an_estimate_of_a_metric_that_ends_covers(tmp_path):
     inputs = [sbt.Parameter(name, -6, 6, "", sbt.Normal(0.0, 1.0)) for name in "ab"]
     scenario = sbt.Scenario("corner", inputs, sbt.Requirement("gap", high=0.0), evaluate=corner, metrics=["gap"])
@@ -295,6 +296,7 @@ def test_what_all_runs_are_alike_in_is_called_no_lead(tmp_path):
     assert "runs at 28 inputs came equally close" in said(0.0, 1)[2].replace("\N{NO-BREAK SPACE}", " ")
 
 
+@pytest.mark.slow
 def test_hits_of_a_metric_of_few_values_are_repeated_until_a_seed_disagrees(tmp_path):
     """Two repeats of 0 or 1 agree by chance: taken for deterministic, the search would leave a place that often fails."""
     inputs = [sbt.Parameter("a", 0, 1), sbt.Parameter("b", 0, 1)]

@@ -240,6 +240,7 @@ def test_parking_is_no_safer_later_weaker_or_hidden() -> None:
     assert stop(0.5) > stop(-0.5) + 0.1, "a car that stands out hides the one that leaves"
 
 
+@pytest.mark.slow
 @pytest.mark.sumo
 def test_hidden_markings_degrade_lane_keeping(monkeypatch: pytest.MonkeyPatch) -> None:
     scenario = load("scenarios", "lane_keeping")

@@ -63,6 +63,7 @@ def test_a_stated_derivative_is_that_of_the_probability(counted):
                 assert row[key] == pytest.approx(probability(*which, row["value"] + side * row["change"]), rel=0.15), which
 
 
+@pytest.mark.slow
 def test_no_draw_that_is_critical_tells_no_sensitivity(counted):
     rows = counted.sensitivity(critical=(-1000.0, -900.0))
     assert rows[["derivative", "std_error", "raised", "lowered"]].isna().all(axis=None)

@@ -22,7 +22,7 @@ import sbt
 
 uvicorn = pytest.importorskip("uvicorn", reason="the extra serve is not installed")
 
-from browser import PROGRAM, Browser  # noqa: E402
+from browser import Browser  # noqa: E402
 from test_accessibility import faults  # noqa: E402
 
 from sbt.errors import InputError  # noqa: E402
@@ -201,7 +201,6 @@ def test_a_campaign_is_stopped_and_resumed(tmp_path: Path) -> None:
 
 
 @pytest.mark.sumo
-@pytest.mark.skipif(PROGRAM is None, reason="there is no Chromium")
 @pytest.mark.parametrize("width", [1280, pytest.param(390, marks=pytest.mark.slow)])
 def test_the_pages_work_in_a_browser(served: Served, width: int) -> None:
     """From the list by keyboard to a campaign, its runs, a film made on demand; no error, no request to elsewhere."""
@@ -225,7 +224,6 @@ def test_the_pages_work_in_a_browser(served: Served, width: int) -> None:
 
 
 @pytest.mark.sumo
-@pytest.mark.skipif(PROGRAM is None, reason="there is no Chromium")
 @pytest.mark.parametrize(("handlers", "heeded"), [
     ("", signal.SIGINT), ("signal.signal(signal.SIGINT, signal.SIG_IGN)", None),
     ("signal.signal(signal.SIGINT, signal.SIG_IGN); signal.signal(signal.SIGTERM, lambda *_: sys.exit())", signal.SIGTERM),

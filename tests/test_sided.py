@@ -51,7 +51,7 @@ def loss(p: Vector, inside: np.ndarray) -> float:
     return -float(np.log(np.clip(np.where(inside, p, 1.0 - p), 1e-9, 1.0)).mean())
 
 
-@pytest.mark.parametrize("metric", [two_values, contact, steps])
+@pytest.mark.parametrize("metric", [two_values, pytest.param(contact, marks=pytest.mark.slow), steps])
 def test_the_sides_of_a_metric_that_jumps_are_learned_sharply_and_calibrated(metric: Callable[[Points], Vector]):
     at, found = stream(9, "at").random((4000, 2)), []
     inside = distance(at) <= 0.0

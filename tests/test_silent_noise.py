@@ -79,6 +79,7 @@ def test_where_all_runs_have_one_metric_draws_count(tmp_path: Path):
     assert min(counted) >= 70
 
 
+@pytest.mark.slow
 def test_draws_that_count_end_where_values_come_that_can_be_followed(tmp_path: Path):
     """A metric with a cap that nothing comes below in the first fifth of the budget: 1 of 240 draws was critical."""
     centre, exact = np.array([1.2, -0.8, 0.6]), 0.003305
@@ -99,6 +100,7 @@ def test_draws_that_count_end_where_values_come_that_can_be_followed(tmp_path: P
     assert result.estimate().probability == pytest.approx(result.conclusion.probability, rel=0.1)  # not by the draws before
 
 
+@pytest.mark.slow
 def test_whether_draws_were_critical_does_not_decide_if_they_count(tmp_path: Path):
     """Those that had met none were left out, and those that had met one counted: 1.3 times P (90 campaigns)."""
 

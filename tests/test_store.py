@@ -403,6 +403,7 @@ def test_a_full_disk_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         assert [r.index for r in store.history().records] == [0, 1, 2]
 
 
+@pytest.mark.slow
 def test_a_campaign_on_a_full_disk_goes_on_when_there_is_room(
     campaign: Callable[..., dict[str, Any]], rows: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ):

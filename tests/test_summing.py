@@ -81,6 +81,7 @@ def missed(result, *, critical):
     return min(-math.log(0.025) * max(p[mine] / times[mine]) / p.sum(), p[mine].sum() / p.sum())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("event", ["few seeds", "few seeds fail"])
 def test_what_few_seeds_decide_is_in_the_interval_of_a_sum(tmp_path, event):
     """Every combination has a value of its own, and 4 % of the seeds give another, or none: two repeats show no noise."""
@@ -187,6 +188,7 @@ def chance(share, fails=0.0):
     return evaluate
 
 
+@pytest.mark.slow
 def test_a_noisy_sum_is_as_precise_as_random_draws_where_few_combinations_have_the_probability(tmp_path):
     """A run of each of 72 combinations left three of 80 to that of seven tenths: 2.8 times the error of random draws."""
     found = [crowded(tmp_path, chance(lambda _: 0.3), seed=seed) for seed in range(16)]
@@ -213,6 +215,7 @@ def test_a_noisy_sum_is_as_precise_as_random_draws_where_few_combinations_have_t
     assert again.frame.drop(columns="seconds").equals(found[0].frame.drop(columns="seconds"))
 
 
+@pytest.mark.slow
 def test_what_random_draws_stand_for_is_unbiased_and_covered(tmp_path):
     """Some of what is mostly critical is not run for itself, and a tenth of the runs fails by chance: both readings count."""
 

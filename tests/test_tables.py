@@ -318,7 +318,7 @@ def test_rows_over_decades_say_that_their_input_is_even_in_the_logarithm(tmp_pat
         foreign(tmp_path / "wrong", even, ", min: 0, logarithmic: true")
 
 
-@pytest.mark.parametrize("high", [-0.1, 9.0, -9.0])
+@pytest.mark.parametrize("high", [9.0, pytest.param(-0.1, marks=pytest.mark.slow), pytest.param(-9.0, marks=pytest.mark.slow)])
 def test_no_table_is_told_to_run_what_it_cannot(folder: Path, high: float) -> None:
     """Its conclusions ended with "campaign: estimation says how probable", which is refused, or with wider ranges."""
     for campaign, more in (("coverage", {}), ("boundary", {"metamodel": "et"}), ("falsification", {"metamodel": "et"})):

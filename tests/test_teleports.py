@@ -204,6 +204,7 @@ def test_nobody_drives_over_a_junction_without_lanes(tmp_path: Path, step: float
     assert "time-to-teleport" not in said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", [0.05, 1.0])
 def test_a_road_that_goes_on_without_a_gap_needs_no_lanes_inside_its_junction(tmp_path: Path, step: float):
     _over(tmp_path, step, "true", "false", ego="ab bc", at="60", other="5")

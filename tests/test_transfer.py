@@ -42,6 +42,7 @@ def old(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_another_version_needs_few_runs_and_none_of_the_old_ones(old, tmp_path):
     warm = run(tmp_path / "warm", scenario("after", LATER), warm_start={"store": str(old), "transfer": True})
     assert warm.conclusion.low <= norm.sf(LATER) <= warm.conclusion.high

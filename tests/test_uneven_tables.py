@@ -39,6 +39,7 @@ def exports(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stated", [True, False])
 def test_no_share_of_the_space_is_told_by_rows_that_results_chose(
     exports: dict[str, Path], tmp_path: Path, stated: bool

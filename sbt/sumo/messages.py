@@ -147,6 +147,8 @@ def _unknown_reference(match: re.Match[str], known: list[Element], files: SumoFi
     kind, name = match.group(1), match.group(2)
     tag = "route" if kind == "route" else "vType"
     ids = [one.attributes["id"] for one in known if one.tag == tag]
+    if name in ids:
+        return "it stands there, below what uses it: move it up"
     return f'define <{tag} id="{name}"> before it, or name one that is there{did_you_mean(name, ids)}'
 
 
@@ -166,6 +168,7 @@ _REMEDIES: tuple[tuple[re.Pattern[str], _Advise], ...] = tuple(
         (r"[Tt]he (?:\w+[- ])?edge '([^']+)' .*is not known", _unknown_edge),
         (r"The (route|vehicle type) '([^']+)' for .* is not known", _unknown_reference),
         (r"Another .* with the id", _fixed("give one of them another id")),
+        (r"Invalid departLane [^:]*int>=0", _fixed("a lane is a whole number: of an input, `kind: integer`")),
         (r"Invalid departLane", _fixed("its first edge must have that lane for its vehicle class")),
         (r"eparture speed for .* too high", _fixed(_SPEED)),
         (r"Negative departure time", _fixed("let it depart at 0 s or later")),
