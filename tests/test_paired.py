@@ -270,6 +270,23 @@ BETTER = scenario(better)
     assert len(re.findall(r'y="138" text-anchor="middle">-?[\d.]+</text>', svg)) >= 3
 
 
+def test_egos_most_of_whose_runs_fail_are_an_exit_code(configured, tmp_path):
+    (tmp_path / "analytic.py").write_text((tmp_path / "analytic.py").read_text() + """
+
+
+def lost(values, seed):
+    return {"y": float("nan") if values["a"] < 0.6 else disc(values, seed)["y"], "noise": 0.0}
+
+
+LOST = scenario(lost)
+""")
+    a, b = configured("a", budget=60), configured("b", "LOST")
+    done = CliRunner().invoke(app, ["compare-ego", str(a), str(b), "--store", str(tmp_path / "both")])
+    assert done.exit_code == 4, done.output
+    assert "of 60 did (after)" in done.stderr
+    assert "failed runs" in done.stdout
+
+
 @pytest.mark.parametrize("ends", [(0.0, 1.0), (-0.73, 0.75), (0.0, 1e-4), (-0.001, 0.002), (0.0, 0.3), (-1.0, 1.0)])
 def test_ticks_of_the_intervals_are_few_and_round(ends):
     from sbt.report.versus import _round_values

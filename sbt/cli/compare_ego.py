@@ -43,6 +43,10 @@ def compare_ego(
             next_command("sumo-sbt", "replay", folder / side, str(found[0]["run"]), "--film", "run.gif")
     if fail_if_rose and result["verdict"] == "rose":
         raise fail("the probability of a critical run rose", Exit.CRITICAL)
+    for name in ("before", "after"):
+        failed, of = result[name]["failed"], result[name]["runs"] if rare else result["pairs"]
+        if 2 * failed > of:
+            raise fail(f"at most half of the runs may fail, but {failed} of {of} did ({name})", Exit.FAILED_RUNS)
 
 
 def _lines(result: Mapping[str, Any]) -> list[str]:
