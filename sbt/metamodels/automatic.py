@@ -69,8 +69,9 @@ class Auto:
     nu 2.5 and one noise, is taken alone unless the mixture is better by three standard errors, and better over the space, too
     (rows crowd at the edge, where a mixture that hedges looks better than it is). Where the metric jumps at the edge, `gp`
     learns a widened jump if that predicts the sides better (see `stepped`); of a noisy one, noise that depends on the inputs
-    (`noise_shape`), or beside the values how often runs are critical (`labelled`); of two values, labels (`flags`). Where it
-    leaves next to nothing to gain, the others are not even tried.
+    (`noise_shape`), or beside the values how often runs are critical (`labelled`); of two values, labels (`flags`); of one that
+    comes in steps, or ends, the range that each run tells (`rounded`). Where it leaves next to nothing to gain, the others are
+    not even tried.
 
     Args:
         folds: of the cross-validation, >= 2.
