@@ -248,9 +248,12 @@ def test_a_named_one_on_a_bridge_is_on_another_level_at_any_distance(tmp_path, h
 
 
 @pytest.mark.sumo
-def test_roads_that_cross_on_one_level_without_a_junction_stay_a_contact_that_sumo_does_not_list(simulate, tmp_path):
+@pytest.mark.parametrize(
+    "others", [{}, {"over": [(60.0, -100.0, 8.0), (60.0, 100.0, 8.0)]}], ids=["a metre apart", "at one height"]
+)
+def test_roads_that_cross_on_one_level_without_a_junction_stay_a_contact_that_sumo_does_not_list(simulate, tmp_path, others):
     """Heights that differ by less than a vehicle say that it is no bridge; SUMO never compares such roads."""
-    level = {"we": [(*p, 0.0) for p in WEST_EAST], "sn": [(*p, 1.0) for p in SOUTH_NORTH]}
+    level = {"we": [(*p, 0.0) for p in WEST_EAST], "sn": [(*p, 0.0 if others else 1.0) for p in SOUTH_NORTH]} | others
     trace = simulate(net(level, z=True), MEETING, deaf("ego", "other"))
     one = simulation(tmp_path, net(level, z=True), MEETING, deaf("ego", "other"), 5.0)
     one({}, 1)

@@ -190,6 +190,7 @@ def test_a_campaign_is_stopped_and_resumed(tmp_path: Path) -> None:
         assert stopped["done"] < 40
         (tmp_path / "hold").unlink()
         assert server.ask(f"/api/{key}/resume", post=True)[0] == 200
+        assert server.ask(f"/api/{key}/resume", post=True)[0] == 409, "it is about to begin"
         assert _until(server, key, "finished")["done"] == 40
     finally:
         driver.kill()

@@ -89,7 +89,7 @@ class Campaigns:
         self._watched: dict[str, _Watched] = {}
         self._searched, self._lock = -_FOUND_AGAIN, threading.Lock()
         self._filming, self._ready = threading.Semaphore(2), False
-        self._resumed: list[subprocess.Popen[bytes]] = []
+        self._resumed: dict[str, subprocess.Popen[bytes]] = {}
 
     def close(self) -> None:
         """Let go of all stores; campaigns go on."""
@@ -207,18 +207,20 @@ class Campaigns:
         """Let a campaign go on in a process of its own, which outlives the server; return what was done.
 
         Raises:
-            InputError: it runs already.
+            InputError: it runs already, or was resumed and is about to.
         """
         folder = self[key].folder
         writer = writer_of(folder)
         if writer is not None and writer.alive is not False:
             raise InputError("only a campaign that does not run can be resumed")
-        with (folder / "serve.log").open("ab") as log:
-            process = subprocess.Popen(
+        with self._lock, (folder / "serve.log").open("ab") as log:
+            self._resumed = {known: process for known, process in self._resumed.items() if process.poll() is None}
+            if key in self._resumed:
+                raise InputError("only a campaign that does not run can be resumed, but this one was, and is about to begin")
+            self._resumed[key] = subprocess.Popen(
                 [sys.executable, "-m", "sbt.serve.task", "resume", str(folder)],
                 env=self._environment(), stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True,
             )  # fmt: skip
-        self._resumed = [each for each in self._resumed if each.poll() is None] + [process]
         return f"resumed; what it says is in {folder / 'serve.log'}"
 
     def _environment(self) -> dict[str, str]:

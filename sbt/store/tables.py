@@ -21,8 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sbt.errors import InputError, RunError
-from sbt.files import write_atomically
+from sbt.errors import InputError, RunError, UnwritableError
 from sbt.problem.arrays import Vector
 from sbt.problem.distribution import Distribution
 from sbt.problem.outcome import Status
@@ -169,14 +168,17 @@ def to_folder(
         "requirement": written_requirement(scenario.requirement),
         **({} if spread_evenly and not scenario.uneven else {"spread_evenly": False}),
     }  # fmt: skip
-    folder.mkdir(parents=True, exist_ok=True)
-    write_atomically(folder / "config.yml", lambda part: YAML().dump(described, part))
+    path = folder / f"runs{suffix}"
     columns = named_columns(done.x, done.names, done.choices) | {name: done.y(name) for name in done.metrics}
     columns = columns | ({} if _SEED in columns else {_SEED: done.seed})
-    path = folder / f"runs{suffix}"
     frame = pd.DataFrame(columns)
-    write = frame.to_csv if suffix == ".csv" else frame.to_parquet
-    return write_atomically(path, lambda part: write(part, index=False))
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        YAML().dump(described, folder / "config.yml")
+        frame.to_csv(path, index=False) if suffix == ".csv" else frame.to_parquet(path, index=False)
+    except OSError as error:
+        raise UnwritableError(error.errno, error.strerror or str(error), str(folder)) from error
+    return path
 
 
 def _table_of(path: Path) -> Path:

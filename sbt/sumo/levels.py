@@ -41,7 +41,7 @@ class Levels:
 
     Attributes:
         apart: edge to the edges that are on another level than it; edges without such are missing.
-        inferred: crossings (edge, edge, x, y) that only the missing junction tells to be bridges: the network is flat there.
+        inferred: crossings (edge, edge, x, y) that only the missing junction tells to be bridges: the network is flat.
         level: those whose heights differ, but by less than a vehicle: roads that meet there, though SUMO does not know it.
         stacked: whether a road passes above another one, or itself, so that heights tell levels.
         guessed: pairs of edges that are apart by inferred crossings alone.
@@ -158,7 +158,7 @@ def _find(sumo: Any) -> Levels:
     for i, j, at_i, at_j, x, y in crossings:
         a, b = roads[i], roads[j]
         height = _height(sumo, a, at_i) - _height(sumo, b, at_j)
-        flat = abs(height) < _FLAT
+        flat = abs(height) < _FLAT and not stacked  # else heights tell that there is no bridge
         if network.connected(a, at_i, b, at_j):
             continue
         if not flat and abs(height) < LEVEL_HEIGHT:
