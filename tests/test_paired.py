@@ -98,16 +98,22 @@ OTHER = replace(scenario(disc), metrics=tuple(replace(m, unit="km") for m in sce
     assert "one requirement, but y is in no unit in" in done.output.replace("\n", " ")
 
 
+def another_ego(folder, name, y):
+    """Add a scenario to the problems of `configured`: what its metric is, in terms of `disc`."""
+    path = folder / "analytic.py"
+    path.write_text(f'''{path.read_text()}
+
+def {name.lower()}(values, seed):
+    return {{"y": {y}, "noise": 0.0}}
+
+
+{name} = scenario({name.lower()})
+''')
+
+
 def test_one_change_through_the_command(configured, tmp_path):
     """The critical disc shrinks when the metric is shifted: only fixed failures, none new."""
-    (tmp_path / "analytic.py").write_text((tmp_path / "analytic.py").read_text() + '''
-
-def better(values, seed):
-    return {"y": disc(values, seed)["y"] + 0.1, "noise": 0.0}
-
-
-BETTER = scenario(better)
-''')
+    another_ego(tmp_path, "BETTER", 'disc(values, seed)["y"] + 0.1')
     a, b = configured("a", budget=300), configured("b", "BETTER")
     done = CliRunner().invoke(app, ["compare-ego", str(a), str(b), "--store", str(tmp_path / "both"), "--json"])
     assert done.exit_code == 0, done.output
@@ -209,14 +215,7 @@ def test_what_no_run_has_met_is_in_the_verdict_of_a_rare_comparison():
 
 def test_a_rare_comparison_searches_the_second_ego(configured, tmp_path):
     """With what the first one taught alone, its start and search were left out."""
-    (tmp_path / "analytic.py").write_text((tmp_path / "analytic.py").read_text() + """
-
-def better(values, seed):
-    return {"y": disc(values, seed)["y"] + 0.1, "noise": 0.0}
-
-
-BETTER = scenario(better)
-""")
+    another_ego(tmp_path, "BETTER", 'disc(values, seed)["y"] + 0.1')
     a, b = (configured(*each, budget=60, metamodel={"kind": "gp"}) for each in (("a",), ("b", "BETTER")))
     command = ["compare-ego", str(a), str(b), "--rare", "--store", str(tmp_path / "both"), "--json"]
     done = CliRunner().invoke(app, command)
@@ -241,15 +240,7 @@ def test_different_questions_are_refused(configured, tmp_path):
 
 def test_the_page_says_what_was_asked_of_which_egos(configured, tmp_path):
     """It had the intervals only as lines, on an axis with one tick, and neither the requirement nor the metrics of a pair."""
-    (tmp_path / "analytic.py").write_text((tmp_path / "analytic.py").read_text() + """
-
-
-def better(values, seed):
-    return {"y": float("inf") if values["a"] < 0.5 else disc(values, seed)["y"], "noise": 0.0}
-
-
-BETTER = scenario(better)
-""")
+    another_ego(tmp_path, "BETTER", 'float("inf") if values["a"] < 0.5 else disc(values, seed)["y"]')
     a, b = configured("a", budget=200), configured("b", "BETTER")
     done = CliRunner().invoke(app, ["compare-ego", str(a), str(b), "--store", str(tmp_path / "both"), "--json"])
     assert done.exit_code == 0, done.output
@@ -271,15 +262,7 @@ BETTER = scenario(better)
 
 
 def test_egos_most_of_whose_runs_fail_are_an_exit_code(configured, tmp_path):
-    (tmp_path / "analytic.py").write_text((tmp_path / "analytic.py").read_text() + """
-
-
-def lost(values, seed):
-    return {"y": float("nan") if values["a"] < 0.6 else disc(values, seed)["y"], "noise": 0.0}
-
-
-LOST = scenario(lost)
-""")
+    another_ego(tmp_path, "LOST", 'float("nan") if values["a"] < 0.6 else disc(values, seed)["y"]')
     a, b = configured("a", budget=60), configured("b", "LOST")
     done = CliRunner().invoke(app, ["compare-ego", str(a), str(b), "--store", str(tmp_path / "both")])
     assert done.exit_code == 4, done.output

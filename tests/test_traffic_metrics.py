@@ -251,7 +251,6 @@ def coming_and_going(rng: np.random.Generator) -> Trace:
     return dataclasses.replace(trace, **states)
 
 
-@pytest.mark.slow
 def test_a_metric_of_a_trace_in_which_the_other_comes_and_goes_is_that_of_the_time_in_which_both_are_there():
     """Nobody who touches the ego is passed over because it was not there before, or is not later."""
     rng = np.random.default_rng(3)

@@ -145,7 +145,7 @@ def reused(log: Log, settings: Settings, space: ParameterSpace, own: Requirement
         int((hits & reached).sum()), int((history.ok & ~hits & reached).sum()),
         history.columns["warm_up"][every], least,
         seen.draws - round(float(nominal.sum())) if not plainly else 0, seen.hits + seen.failed, seen.known,
-        Unviolated.of(history, settings), seen.surprises + int((others & denied).sum()), seen.surprised > draws[-1].number >= 0,
+        Unviolated.of(history, settings), seen.surprises + int((others & denied).sum()), seen.late and not plainly,
     )  # fmt: skip
 
 

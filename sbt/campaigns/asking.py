@@ -8,7 +8,7 @@ import numpy as np
 
 from sbt.campaigns.again import Reused
 from sbt.campaigns.clustering import spread_of_batches
-from sbt.campaigns.counting import FEW_KNOWN
+from sbt.campaigns.counting import FEW_KNOWN, at_least, denied_late
 from sbt.campaigns.estimation import Concluded, EstimationConclusion, on_warm_ups
 from sbt.campaigns.gate import Limits
 from sbt.campaigns.precision import cautions
@@ -95,15 +95,14 @@ def _from_batches(found: Reused) -> Concluded:
         warnings.append("no counted draw was critical: only an upper bound is given")
     elif found.known < FEW_KNOWN:
         limits = limits.reaching(lambda c: defended_bound(found.met, found.unmet, found.ratio, c))
-        draws = f"the upper end is at least that of {_draws_words(found)}"
-        warnings.append(f"critical runs are known at {plural(found.known, 'input')}, fewer than {FEW_KNOWN}: {draws}")
+        met = f"critical runs are known at {plural(found.known, 'input')}"
+        warnings.append(f"{met}, fewer than {FEW_KNOWN}: {at_least(_draws_words(found))}")
     elif few_low or few_high:
         met = f"{plural(hits, 'counted draw')} critical" if hits < FEW_HITS else f"{plural(misses, 'counted draw')} safe"
         warnings.append(f"only {met}, fewer than {FEW_HITS}: the interval is that of so small a number")
     if found.late and hits and misses:
         limits = limits.reaching(lambda c: defended_bound(found.met, found.unmet, found.ratio, c))
-        at_least = f"the upper end is at least that of {_draws_words(found)}"
-        warnings.append(f"a draw after the last one that counts was critical where the metamodel denied it: {at_least}")
+        warnings.append(denied_late(_draws_words(found)))
     if found.critical:
         def alone(c: float) -> float:
             return defended_bound(found.failed, found.unmet, found.ratio, c)

@@ -24,8 +24,8 @@ from sbt.store.history import History
 from sbt.store.records import Iteration
 
 __all__ = [
-    "DENIED", "DRAWN", "FEW_KNOWN", "LEARNED", "NOMINAL", "RANDOM", "Seen", "counted_batches", "counted_iterations", "crude_rows",
-    "denied_by_draws", "hardly_known", "held", "random_draws", "with_event",
+    "DENIED", "DRAWN", "FEW_KNOWN", "LEARNED", "NOMINAL", "RANDOM", "Seen", "at_least", "counted_batches", "counted_iterations",
+    "crude_rows", "denied_by_draws", "denied_late", "hardly_known", "held", "random_draws", "with_event",
 ]  # fmt: skip
 
 DRAWN = "estimation"
@@ -131,7 +131,7 @@ class Seen:
         failed_apart: of these, draws of other stages than those that the estimate is of.
         surprises: critical ones of these draws to which the metamodel gave next to no probability.
         known: different inputs of critical runs; where any of several requirements is enough, of the one that is known by fewest.
-        surprised: number of the last batch that had a surprise; -1: none had.
+        late: whether one of them came after the last batch that counts.
     """
 
     critical: int
@@ -141,7 +141,7 @@ class Seen:
     failed: int
     surprises: int
     known: int
-    surprised: int = -1
+    late: bool = False
     failed_apart: int = 0
 
     @property
@@ -175,7 +175,8 @@ class Seen:
         return cls(
             int(critical.sum()), int((history.ok & ~critical).sum()), len(mine), int(critical[mine].sum()),
             int((~history.ok[mine]).sum()), int((told[mine] & denied).sum()),
-            _known(settings.scenario.requirement, history), surprised, int((~history.ok & (history.stage != DRAWN))[mine].sum()),
+            _known(settings.scenario.requirement, history), surprised > max(counted_iterations(log), default=surprised),
+            int((~history.ok & (history.stage != DRAWN))[mine].sum()),
         )  # fmt: skip
 
     def most(self, hits: int, confidence: float) -> float:
@@ -227,6 +228,16 @@ def held(limits: Limits, seen: Seen, low: float, high: float, *, unstated: bool)
 def hardly_known(value: float, std_error: float) -> bool:
     """Return whether an estimate, or what it leaves to 1, is little more than its standard error."""
     return std_error > _HARDLY * min(value, 1.0 - value)
+
+
+def at_least(draws: str) -> str:
+    """Return in words what draws that no metamodel has chosen say of an upper limit."""
+    return f"the upper end is at least that of {draws}"
+
+
+def denied_late(draws: str) -> str:
+    """Return in words what a late surprise does to an upper limit."""
+    return f"a draw after the last one that counts was critical where the metamodel denied it: {at_least(draws)}"
 
 
 def denied_by_draws(seen: Seen, low: float, high: float, confidence: float) -> tuple[str, ...]:

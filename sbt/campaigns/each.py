@@ -104,7 +104,7 @@ def _from_batches(log: Log, settings: Settings, confidence: float) -> tuple[Requ
         else:
             ends = _ends(spread_of_draws(log, safe, critical), value, low, high, few=few, confidence=tail)
             seen = _seen(part, log, settings)
-            reaches = seen.known < FEW_KNOWN or seen.surprised > counted_iterations(log)[-1]
+            reaches = seen.known < FEW_KNOWN or seen.late
             ends = ends[0], max(ends[1], seen.most_critical(tail)) if reaches else ends[1]
         found.append(RequirementEstimate(part.label, value, min(ends[0], value), max(ends[1], value), hits))
     return tuple(found)

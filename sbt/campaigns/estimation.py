@@ -13,9 +13,11 @@ from sbt.campaigns.counting import (
     NOMINAL,
     RANDOM,
     Seen,
+    at_least,
     counted_batches,
     counted_iterations,
     denied_by_draws,
+    denied_late,
     hardly_known,
     held,
 )
@@ -241,7 +243,6 @@ def _from_batches(log: Log, settings: Settings, seen: Seen | None = None) -> Con
     value, exact_bound = _clipped(low.value), None
     limits = Limits(lambda c: low.limit(c, side=-1, few=few_low), lambda c: high.limit(c, side=1, few=few_high))
     failing, draws = not log.history.ok.all(), f"{plural(seen.draws, 'draw')} from the inputs' distribution"
-    at_least = f"the upper end is at least that of {draws}"
     if hits and misses:
         unstated = failing and any(map(is_two_level, log.iterations))
         limits = held(limits, seen, low.value, high.value, unstated=unstated)
@@ -267,15 +268,16 @@ def _from_batches(log: Log, settings: Settings, seen: Seen | None = None) -> Con
         limits = limits.reaching(seen.most_critical)
         need = settings.scenario.requirement
         whose = " of a requirement" if isinstance(need, CombinedRequirement) and need.how == "any" else ""
-        warnings.append(f"critical runs{whose} are known at {plural(seen.known, 'input')}, fewer than {FEW_KNOWN}: {at_least}")
+        met = f"critical runs{whose} are known at {plural(seen.known, 'input')}"
+        warnings.append(f"{met}, fewer than {FEW_KNOWN}: {at_least(draws)}")
     elif min(hits, misses) < FEW_HITS:
         few, what = (hits, "critical") if hits < FEW_HITS else (misses, "safe")
         met = f"{few} counted draw{' was' if few == 1 else 's were'} {what}"
         warnings.append(f"only {met}, fewer than {FEW_HITS}: so small a number, or {draws}, set the interval")
-    late = hits > 0 and misses > 0 and seen.surprised > counted_iterations(log)[-1]
+    late = hits > 0 and misses > 0 and seen.late
     if late:
         limits = limits.reaching(seen.most_critical)
-        warnings.append(f"a draw after the last one that counts was critical where the metamodel denied it: {at_least}")
+        warnings.append(denied_late(draws))
     highest = max(_clipped(high.value), value)
     if not late and (few_low or few_high or hardly_known(value, low.std_error) or hardly_known(highest, high.std_error)):
         limits = limits.within(seen.limits, value, highest)

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from sbt.campaigns.clustering import spread_of_draws
-from sbt.campaigns.counting import Seen, counted_batches, counted_iterations, random_draws
+from sbt.campaigns.counting import Seen, counted_batches, random_draws
 from sbt.campaigns.gate import Limits
 from sbt.campaigns.records import EXPLORE, EstimationProposal, PoolSummary
 from sbt.campaigns.repeats import simulator_noise
@@ -184,7 +184,7 @@ def only_unseen(log: Log, settings: Settings) -> bool:
     enough = _is_narrow(log, settings, _TARGET if target is None else target)
     if settings.gate is None or not enough or not trusts_search(log, settings):
         return False
-    return Seen.of(log, settings).surprised <= counted_iterations(log)[-1]
+    return not Seen.of(log, settings).late
 
 
 def steadier(log: Log, error: float) -> int | None:

@@ -12,7 +12,16 @@ import typer
 
 from sbt.cli.completion import complete_stores
 from sbt.cli.conclusion import conclusion_lines, show_conclusion, shown
-from sbt.cli.console import Exit, ProgressDisplay, clean_stdout, fail, next_command, print_json, resumable
+from sbt.cli.console import (
+    Exit,
+    ProgressDisplay,
+    clean_stdout,
+    fail,
+    fail_where_most_failed,
+    next_command,
+    print_json,
+    resumable,
+)
 from sbt.cli.progress import duration
 from sbt.errors import InputError
 from sbt.plugins.approval import trust_store
@@ -113,9 +122,7 @@ def _conclude(result: Mapping[str, Any], *, fail_on_critical: bool, junit: Path 
         raise fail(f"gate {gate['verdict']}: {gate['statement']}", Exit.CRITICAL)
     if fail_on_critical and result["critical"] > 0:
         raise fail(f"{result['critical']} critical runs", Exit.CRITICAL)
-    if 2 * result["failed"] > result["runs"]:
-        reason = f"at most half of the runs may fail, but {result['failed']} of {result['runs']} did"
-        raise fail(f"{reason}; the report and `sumo-sbt export` show why", Exit.FAILED_RUNS)
+    fail_where_most_failed(result["failed"], result["runs"], "; the report and `sumo-sbt export` show why")
 
 
 def status(

@@ -8,7 +8,17 @@ from typing import Annotated, Any
 
 import typer
 
-from sbt.cli.console import Exit, ProgressDisplay, clean_stdout, fail, infinite, next_command, print_json, resumable
+from sbt.cli.console import (
+    Exit,
+    ProgressDisplay,
+    clean_stdout,
+    fail,
+    fail_where_most_failed,
+    infinite,
+    next_command,
+    print_json,
+    resumable,
+)
 
 __all__ = ["compare_ego"]
 
@@ -44,9 +54,7 @@ def compare_ego(
     if fail_if_rose and result["verdict"] == "rose":
         raise fail("the probability of a critical run rose", Exit.CRITICAL)
     for name in ("before", "after"):
-        failed, of = result[name]["failed"], result[name]["runs"] if rare else result["pairs"]
-        if 2 * failed > of:
-            raise fail(f"at most half of the runs may fail, but {failed} of {of} did ({name})", Exit.FAILED_RUNS)
+        fail_where_most_failed(result[name]["failed"], result[name]["runs"] if rare else result["pairs"], f" ({name})")
 
 
 def _lines(result: Mapping[str, Any]) -> list[str]:

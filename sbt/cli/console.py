@@ -25,7 +25,8 @@ from sbt.errors import FailedRunsError, InputError, SbtError, command_of
 from sbt.execution.streams import SteadyStream, UnwrittenError, open_missing
 
 __all__ = [
-    "Exit", "ProgressDisplay", "clean_stdout", "fail", "infinite", "next_command", "print_json", "process", "resumable", "verb",
+    "Exit", "ProgressDisplay", "clean_stdout", "fail", "fail_where_most_failed", "infinite", "next_command", "print_json",
+    "process", "resumable", "verb",
 ]  # fmt: skip
 
 P = ParamSpec("P")
@@ -51,6 +52,12 @@ def fail(message: str, code: Exit) -> typer.Exit:
     """Print a message on stderr and return the exception that ends the process with this code."""
     print(message, file=sys.stderr, flush=True)
     return typer.Exit(int(code))
+
+
+def fail_where_most_failed(failed: int, runs: int, more: str) -> None:
+    """Raise the exit of runs of which most failed; `more` ends the sentence."""
+    if 2 * failed > runs:
+        raise fail(f"at most half of the runs may fail, but {failed} of {runs} did{more}", Exit.FAILED_RUNS)
 
 
 def verb(function: Callable[P, None]) -> Callable[P, None]:

@@ -103,7 +103,7 @@ def fitted(u: Points, low: Vector, high: Vector, start: Hyper, priors: Priors) -
     Args:
         u: (m, d) rows.
         low: (m,) lower ends of the intervals in which the latent function with its noise lies.
-        high: (m,) upper ends.
+        high: (m,) upper ends; equal to the lower one where the latent function was measured, with its noise.
         start: where L-BFGS starts.
         priors: of the hyperparameters.
 

@@ -62,6 +62,11 @@ class Rounding:
     edge: float
     width: float
 
+    @property
+    def in_steps(self) -> bool:
+        """Whether the metric comes in steps, rather than ends somewhere."""
+        return self.width > 0.0
+
     def take(self, rows: NDArray[np.intp]) -> Rounding:
         """Return what these rows tell."""
         return replace(self, low=self.low[rows], high=self.high[rows])
@@ -265,7 +270,7 @@ def without_unit(
     """
     if warp is None or not np.std(y) > 0.0:
         return True
-    if told.width == 0.0:
+    if not told.in_steps:
         return False
     few = _some(np.argsort(np.abs(y - critical.edge), kind="stable"), _LEARNED, rng)
     plain = _learned(told, critical, u, y, None, few)[1]

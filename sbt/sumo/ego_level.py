@@ -128,7 +128,7 @@ class EgoLevel:
         if apart is None or road not in apart:
             return False
         roads = own_road, road
-        if roads not in self._notes and roads in self._levels.guessed:
+        if roads not in self._notes and not self._levels.stacked:
             self._note(roads, name, variables, person=person)
         return True
 

@@ -42,16 +42,14 @@ class Levels:
     Attributes:
         apart: edge to the edges that are on another level than it; edges without such are missing.
         inferred: crossings (edge, edge, x, y) that only the missing junction tells to be bridges: the network is flat.
-        level: those whose heights differ, but by less than a vehicle: roads that meet there, though SUMO does not know it.
+        level: those where heights are told, but differ by less than a vehicle: roads that meet there unknown to SUMO.
         stacked: whether a road passes above another one, or itself, so that heights tell levels.
-        guessed: pairs of edges that are apart by inferred crossings alone.
     """
 
     apart: Mapping[str, frozenset[str]] = field(default_factory=dict)
     inferred: tuple[tuple[str, str, float, float], ...] = ()
     level: tuple[tuple[str, str, float, float], ...] = ()
     stacked: bool = False
-    guessed: frozenset[tuple[str, str]] = frozenset()
 
     @property
     def several(self) -> bool:
@@ -148,31 +146,29 @@ def _roads(sumo: Any) -> list[_Road]:
 
 def _find(sumo: Any) -> Levels:
     roads = _roads(sumo)
-    crossings, stacked = list(_crossings(roads)), _stacked(sumo, roads)
+    crossings = list(_crossings(roads))
+    heights = [_height(sumo, roads[i], at_i) - _height(sumo, roads[j], at_j) for i, j, at_i, at_j, _, _ in crossings]
+    stacked = max(map(abs, heights), default=0.0) >= LEVEL_HEIGHT or _stacked(sumo, roads)
     if not crossings:
         return Levels(stacked=stacked)
     network = _Network(roads)
     apart: dict[str, set[str]] = defaultdict(set)
-    guessed, decided = set[tuple[str, str]](), set[tuple[str, str]]()
     inferred, level = [], []
-    for i, j, at_i, at_j, x, y in crossings:
+    for (i, j, at_i, at_j, x, y), height in zip(crossings, heights, strict=True):
         a, b = roads[i], roads[j]
-        height = _height(sumo, a, at_i) - _height(sumo, b, at_j)
-        flat = abs(height) < _FLAT and not stacked  # else heights tell that there is no bridge
         if network.connected(a, at_i, b, at_j):
             continue
-        if not flat and abs(height) < LEVEL_HEIGHT:
+        if abs(height) < _FLAT and not stacked:  # else heights tell that there is no bridge
+            inferred.append((a.edge, b.edge, x, y))
+        elif abs(height) < LEVEL_HEIGHT:
             level.append((a.edge, b.edge, x, y))
             continue
-        if flat:
-            inferred.append((a.edge, b.edge, x, y))
         for one, other in product(network.road(a, at_i), network.road(b, at_j)):
             if not network.near(one, other):
                 apart[one.edge].add(other.edge)
                 apart[other.edge].add(one.edge)
-                (guessed if flat else decided).update(((one.edge, other.edge), (other.edge, one.edge)))
     known = {edge: frozenset(others) for edge, others in apart.items()}
-    return Levels(known, tuple(inferred), tuple(level), stacked, frozenset(guessed - decided))
+    return Levels(known, tuple(inferred), tuple(level), stacked)
 
 
 def _stacked(sumo: Any, roads: list[_Road]) -> bool:

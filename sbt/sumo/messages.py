@@ -168,7 +168,7 @@ _REMEDIES: tuple[tuple[re.Pattern[str], _Advise], ...] = tuple(
         (r"[Tt]he (?:\w+[- ])?edge '([^']+)' .*is not known", _unknown_edge),
         (r"The (route|vehicle type) '([^']+)' for .* is not known", _unknown_reference),
         (r"Another .* with the id", _fixed("give one of them another id")),
-        (r"Invalid departLane [^:]*int>=0", _fixed("a lane is a whole number: of an input, `kind: integer`")),
+        (r"Invalid departLane [^:]*int>=0", _fixed("name one of these, or a whole number: of an input, `kind: integer`")),
         (r"Invalid departLane", _fixed("its first edge must have that lane for its vehicle class")),
         (r"eparture speed for .* too high", _fixed(_SPEED)),
         (r"Negative departure time", _fixed("let it depart at 0 s or later")),
