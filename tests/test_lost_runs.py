@@ -13,7 +13,7 @@ from sbt.campaigns.clustering import Spread
 from sbt.campaigns.combinations import EveryCombination
 from sbt.campaigns.estimation import EstimationConclusion
 from sbt.campaigns.gate import GateVerdict
-from sbt.campaigns.lost import failed_runs, runs_to_halve
+from sbt.campaigns.lost import failed_runs, narrower, runs_to_halve
 from sbt.campaigns.parts import CriticalShare
 from sbt.campaigns.telling import tell_boundary, tell_estimation, tell_share
 from sbt.cli import app
@@ -194,7 +194,7 @@ def test_a_failed_run_is_told_to_count_where_the_interval_depends_on_it(tmp_path
     for stage in np.unique(history.stage[safe]):
         row = np.flatnonzero(safe & (history.stage == stage))[-1]
         found = concluded(np.arange(len(history)) == row)
-        counts = "count them as safe, the upper end as critical" in found.warnings[0]
+        counts = "the upper end" in found.warnings[0]
         assert counts or found.warnings[0] == f"1 of {budget} runs failed, none of them a draw that counts"
         assert counts == ((before.high, before.low) != (found.high, found.low)), stage
         told.add(counts)
@@ -208,6 +208,16 @@ def test_failed_runs_are_told_apart_by_whether_they_count():
     (some,) = failed_runs(1, 3, 9)
     assert some.startswith("3 of 9 runs failed: the estimate and its lower end count 1 of them as safe")
     assert some.endswith("the others are no draws that count")
+    (apart,) = failed_runs(1, 3, 9, beside=2)
+    assert apart == "3 of 9 runs failed: the estimate and its lower end count 1 of them as safe, the upper end 3 as critical"
+    (only,) = failed_runs(0, 3, 9, beside=2)
+    assert only == "3 of 9 runs failed: the upper end counts 2 of them as critical; the others are no draws that count"
+
+
+def test_failed_runs_decide_an_upper_end_of_whose_distance_they_make_up_half():
+    assert narrower(0.02, 0.07, 0.1, "more runs").startswith("failed runs decide the width of the interval")
+    first = narrower(0.02, 0.03, 0.09, "more runs")
+    assert first.startswith("more runs bring the upper end of the interval, 0.09, to about 0.03, as far as these tell")
 
 
 @pytest.mark.parametrize(

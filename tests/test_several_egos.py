@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from test_doors import check, files_of
+from test_evidence import deaf, net, simulation, vehicle
 
 import sbt
+from sbt.config.own_metrics import metrics_of_several
 from sbt.errors import InputError, RunError
 from sbt.execution.spec import ScenarioSpec
+from sbt.metrics.conflict_types import conflict
+from sbt.metrics.traffic import any_collision, nearest_distance, ttc_path_min
+from sbt.report.contacts import contacts_of
+from sbt.sumo.ego_vehicle import EgoVehicle
 from sbt.workflows.judging import judge_run
 
 ROUTES = """<routes>
@@ -111,3 +118,39 @@ def test_reference_drivers_take_the_places_of_all_vehicles_under_test(tmp_path):
     assert row["y.ttc_min"] == row["y.ttc_min_av2"] < 1.0 < row["y.ttc_min_av1"], "the second one fails"
     (judged,) = judge_run(store, int(row["index"]), ["cc_human"])
     assert judged.avoided is not None
+
+
+@pytest.mark.sumo
+def test_each_has_a_level_of_its_own(tmp_path):
+    """In the plane ego, b on the bridge and c below b all meet; what c is to b, ego's recorder brought into one trace."""
+    below = [(-100.0, 0.0, 0.0), (100.0, 0.0, 0.0)]
+    bridge = [(0.0, -100.0, 6.0), (0.0, 100.0, 6.0)]
+    starts = (("b", "over", 20), ("ego", "we", 20), ("c", "we", 33))
+    vehicles = "".join(vehicle(name, road, departPos=at) for name, road, at in starts)
+    one = simulation(tmp_path, net({"we": below, "over": bridge}, z=True), vehicles, deaf("ego", "b", "c"), 6.0)
+    alone = one({}, 1)
+    both = replace(one, recording=replace(one.recording, further=(EgoVehicle("b", may_leave=True),)))({}, 1)
+    assert (both.ended, both.actors) == ("duration", ("ego", "c", "b"))
+    assert both.seen_by("ego").identical(alone)
+    assert both.seen_by("b").actors == ("b",)
+    for kind in (nearest_distance, any_collision, ttc_path_min):
+        worst, *each = metrics_of_several({ego: kind(ego) for ego in ("ego", "b")})
+        assert [m.value(both) for m in each] == [kind("ego").value(alone), kind("b").without]
+        assert worst.value(both) == each[0].value(both)
+    assert conflict(both, "ego", ())[0] == "c"
+    assert conflict(both, "b", ()) is None
+    assert contacts_of(both) == ()
+    last = both.select(slice(10, 40))
+    assert [len(last.seen_by(ego).time) for ego in ("ego", "b")] == [30, 30]
+    assert last.seen_by("b").time[0] == both.time[10]
+
+
+@pytest.mark.sumo
+def test_a_contact_of_two_of_them_is_that_of_both(tmp_path):
+    vehicles = vehicle("av1", "we", departPos=40, departSpeed=5) + vehicle("av2", "we", departPos=20, departSpeed=15)
+    one = simulation(tmp_path, net({"we": [(-100.0, 0.0), (100.0, 0.0)]}), vehicles, deaf("av1", "av2"), 6.0)
+    egos = [EgoVehicle(name, may_leave=True) for name in ("av1", "av2")]
+    for first, second in (egos, egos[::-1]):
+        trace = replace(one, recording=replace(one.recording, ego=first, further=(second,)))({}, 1)
+        assert trace.ended == "collision"
+        assert [m.value(trace) for m in metrics_of_several({e.id: any_collision(e.id) for e in egos})] == [1, 1, 1]

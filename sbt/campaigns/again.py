@@ -15,6 +15,7 @@ from threadpoolctl import threadpool_limits
 
 from sbt.campaigns.counting import DENIED, DRAWN, NOMINAL, Seen
 from sbt.campaigns.crude import nominal_rows, took_monte_carlo
+from sbt.campaigns.gate import Limits
 from sbt.campaigns.known import Known
 from sbt.campaigns.pools import Frame, admitted, most_nominal, sample_mixture
 from sbt.campaigns.records import EstimationProposal
@@ -25,7 +26,7 @@ from sbt.errors import InputError
 from sbt.estimators.choices import choice_scores, log_normal
 from sbt.estimators.events import events
 from sbt.estimators.mixture import Mixture, Near, fit_mixture, particles, wide_scales, within_reach
-from sbt.estimators.reweighting import Predicted, ReusedBatch, effective_size
+from sbt.estimators.reweighting import Predicted, ReusedBatch, defended_bound, effective_size
 from sbt.estimators.surrogate import Coordinates, LogProbability
 from sbt.loop.stages import Log
 from sbt.problem.arrays import Mask, Points, Vector
@@ -52,6 +53,7 @@ _FAR = 30.0
 """Normal score beyond which there is nothing to propose."""
 _RATIOS = 2**13
 """Draws from the new distribution, which tell how much less of the old one there is."""
+_UNSEEN = Seen(0, 0, 0, 0, 0, 0, 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,11 +72,8 @@ class Reused:
         warm_up: (n,) that each draw began with, -1 without one.
         least: effective sample size below which the draws say nothing.
         taught: further draws from the campaign's distribution, which taught and do not count.
-        met: of all draws from the campaign's distribution, those that were critical or failed.
-        known: different inputs of critical runs.
+        seen: what all draws from the campaign's distribution met.
         unviolated: requirements that no run violated.
-        surprises: of these draws, critical ones that a metamodel had denied.
-        late: one of them came after the last batch that counts.
     """
 
     space: ParameterSpace
@@ -89,16 +88,25 @@ class Reused:
     warm_up: Vector
     least: float
     taught: int = 0
-    met: int = 0
-    known: int = 0
+    seen: Seen = _UNSEEN
     unviolated: Unviolated = field(default_factory=Unviolated)
-    surprises: int = 0
-    late: bool = False
 
     @property
     def unmet(self) -> Vector:
         """The share of each draw that is in proportion to the campaign's distribution, of those that taught as well."""
         return np.concatenate([self.nominal, np.ones(self.taught)])
+
+    def most(self, hits: int, confidence: float) -> float:
+        """Return the upper limit of the probability of what the draws from the campaign's distribution met so many times."""
+        return defended_bound(hits, self.unmet, self.ratio, confidence)
+
+    @property
+    def limits(self) -> Limits:
+        """Limits by the draws from the campaign's distribution alone, failed ones as safe below and as critical above."""
+        seen = self.seen
+        return Limits(
+            lambda c: 1.0 - self.most(seen.draws - seen.hits, c), lambda c: self.most(seen.hits + seen.failed, c)
+        )
 
 
 def reused(log: Log, settings: Settings, space: ParameterSpace, own: Requirement) -> Reused:
@@ -144,8 +152,9 @@ def reused(log: Log, settings: Settings, space: ParameterSpace, own: Requirement
         np.exp(space.log_density(x) - old.log_density(x)), crude,
         int((hits & reached).sum()), int((history.ok & ~hits & reached).sum()),
         history.columns["warm_up"][every], least,
-        seen.draws - round(float(nominal.sum())) if not plainly else 0, seen.hits + seen.failed, seen.known,
-        Unviolated.of(history, settings), seen.surprises + int((others & denied).sum()), seen.late and not plainly,
+        0 if plainly else seen.draws - round(float(nominal.sum())),
+        replace(seen, surprises=seen.surprises + int((others & denied).sum()), late=seen.late and not plainly),
+        Unviolated.of(history, settings),
     )  # fmt: skip
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from sbt.campaigns.again import Reused
 from sbt.campaigns.clustering import spread_of_batches
-from sbt.campaigns.counting import FEW_KNOWN, at_least, denied_late
+from sbt.campaigns.counting import FEW_KNOWN, at_least, denied_by_draws, denied_late, hardly_known
 from sbt.campaigns.estimation import Concluded, EstimationConclusion, on_warm_ups
 from sbt.campaigns.gate import Limits
 from sbt.campaigns.precision import cautions
@@ -74,47 +74,44 @@ def _from_batches(found: Reused) -> Concluded:
     low, high = combine_estimates(safe), combine_estimates(worst)
     hits, perhaps, misses = sum(b.hits for b in safe), sum(b.hits for b in worst), sum(b.misses for b in worst)
     not_hits = sum(b.misses for b in safe)
-    missed = defended_bound(found.surprises, found.unmet, found.ratio, _CONFIDENCE)
-
-    def bound(count: int, confidence: float) -> float:
-        return defended_bound(count, found.nominal, found.ratio, confidence)
-
+    seen, drawn, draws = found.seen, found.limits, f"{plural(found.seen.draws, 'draw')} from the campaign's distribution"
     few_low, few_high = min(hits, not_hits) < FEW_HITS, min(perhaps, misses) < FEW_HITS
     value, exact, warnings = min(max(low.value, 0.0), 1.0), None, []
     limits = Limits(lambda c: low.limit(c, side=-1, few=few_low), lambda c: high.limit(c, side=1, few=few_high))
     if not found.critical:
-        value, limits = 0.0, Limits(lambda _: 0.0, lambda c: bound(perhaps, c))
+        value, limits = 0.0, Limits(lambda _: 0.0, drawn.upper)
         exact = limits.upper(_CONFIDENCE)
         warnings.append("nothing critical was met: the probability is only bounded from above")
     elif not found.safe or misses == 0:
-        value = value if found.safe or not_hits else 1.0
-        limits = Limits(lambda c: 1.0 - bound(not_hits, c), lambda _: 1.0)
+        value, missed = value if found.safe or not_hits else 1.0, drawn.lower if few_low else limits.lower
+        least = (lambda c: min(low.limit(c, side=-1), missed(c))) if found.safe else drawn.lower
+        limits = Limits(least, lambda _: 1.0)
         warnings.append(_NONE_SAFE)
     elif hits == 0:
-        limits = Limits(lambda _: 0.0, lambda c: max(high.limit(c, side=1), bound(perhaps, c)))
+        missed = drawn.upper if few_high else limits.upper
+        limits = Limits(lambda _: 0.0, lambda c: max(high.limit(c, side=1), missed(c)))
         warnings.append("no counted draw was critical: only an upper bound is given")
-    elif found.known < FEW_KNOWN:
-        limits = limits.reaching(lambda c: defended_bound(found.met, found.unmet, found.ratio, c))
-        met = f"critical runs are known at {plural(found.known, 'input')}"
-        warnings.append(f"{met}, fewer than {FEW_KNOWN}: {at_least(_draws_words(found))}")
+    elif seen.known < FEW_KNOWN:
+        limits = limits.reaching(drawn.upper)
+        met = f"critical runs are known at {plural(seen.known, 'input')}"
+        warnings.append(f"{met}, fewer than {FEW_KNOWN}: {at_least(draws)}")
     elif few_low or few_high:
         met = f"{plural(hits, 'counted draw')} critical" if hits < FEW_HITS else f"{plural(misses, 'counted draw')} safe"
-        warnings.append(f"only {met}, fewer than {FEW_HITS}: the interval is that of so small a number")
-    if found.late and hits and misses:
-        limits = limits.reaching(lambda c: defended_bound(found.met, found.unmet, found.ratio, c))
-        warnings.append(denied_late(_draws_words(found)))
+        warnings.append(f"only {met}, fewer than {FEW_HITS}: so small a number, or {draws}, set the interval")
+    late = hits > 0 and misses > 0 and seen.late
+    if late:
+        limits = limits.reaching(drawn.upper)
+        warnings.append(denied_late(draws))
+    tail, highest = 0.5 * (1.0 + _CONFIDENCE), max(min(max(high.value, 0.0), 1.0), value)
+    if not late and (few_low or few_high or hardly_known(value, low.std_error) or hardly_known(highest, high.std_error)):
+        limits = limits.within(drawn, value, highest)
+        warnings += denied_by_draws(drawn, draws, value, highest, tail)
     if found.critical:
-        def alone(c: float) -> float:
-            return defended_bound(found.failed, found.unmet, found.ratio, c)
-
-        limits = found.unviolated.reached(limits, alone, lambda c: defended_bound(found.met, found.unmet, found.ratio, c))
-        warnings += found.unviolated.sentences(_draws_words(found), alone(0.5 * (1.0 + _CONFIDENCE)))
-    warnings += cautions(len(safe), low.largest_term, value, found.surprises)
-    return _conclusion(value, limits, low.std_error, max(min(max(high.value, 0.0), 1.0), value), hits, missed, exact, warnings)
-
-
-def _draws_words(found: Reused) -> str:
-    return f"{plural(round(float(found.unmet.sum())), 'draw')} from the campaign's distribution"
+        limits = found.unviolated.reached(limits, lambda c: found.most(seen.failed, c), drawn.upper)
+        warnings += found.unviolated.sentences(draws, found.most(seen.failed, tail))
+    warnings += cautions(len(safe), low.largest_term, value, seen.surprises)
+    unseen = found.most(seen.surprises, _CONFIDENCE)
+    return _conclusion(value, limits, low.std_error, highest, hits, unseen, exact, warnings)
 
 
 def _from_nominal(found: Reused) -> Concluded:

@@ -122,7 +122,9 @@ class BoundaryConclusion:
         condition = requirement_words(facts.requirement, facts.unit, facts.units)
         told = tell_boundary(self, measured, facts) if every is None else every.sentences(facts.scenario, condition)
         told += [] if self.critical_combinations is None else [self.critical_combinations.sentence(facts.units or {})]
-        found = [*told, *shares_words(self.held_out_fractions), *conditional_on(facts.history)]
+        each = {name: share.given_a_metric for name, share in (self.held_out_fractions or {}).items()}
+        held_out = " in the held-out runs" + (" that gave a metric" if measured.lost else "")
+        found = [*told, *shares_words(each, held_out), *conditional_on(facts.history)]
         found += [*fits_words(self.requirements), *independence_words(self.independence)]
         found += failing_words(self.failing_fraction, self.fails_by_chance, self.failing_range, self.critical_range, facts)
         if self.earlier is not None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sbt.campaigns.gate import Limits
 from sbt.campaigns.records import CountedDraws, EstimationProposal, EventDraws, PoolSummary
 from sbt.campaigns.settings import Settings
-from sbt.campaigns.wording import number, plural
+from sbt.campaigns.wording import number
 from sbt.errors import InputError
 from sbt.estimators import binomial
 from sbt.estimators.intervals import CountedBatch
@@ -240,10 +240,9 @@ def denied_late(draws: str) -> str:
     return f"a draw after the last one that counts was critical where the metamodel denied it: {at_least(draws)}"
 
 
-def denied_by_draws(seen: Seen, low: float, high: float, confidence: float) -> tuple[str, ...]:
-    """Return in words that draws from the inputs' distribution deny an estimate, low to high; () where they do not."""
-    draws = f"{plural(seen.draws, 'draw')} from the inputs' distribution alone"
-    least, most = seen.limits.lower(confidence), seen.limits.upper(confidence)
+def denied_by_draws(drawn: Limits, draws: str, low: float, high: float, confidence: float) -> tuple[str, ...]:
+    """Return in words that limits by draws that no metamodel has chosen deny an estimate, low to high; () where they do not."""
+    least, most = drawn.lower(confidence), drawn.upper(confidence)
     if most < low:
-        return (f"{draws} deny the estimate: by them the probability is at most {number(most, 2)}",)
-    return (f"{draws} deny the estimate: by them the probability is at least {number(least, 2)}",) if least > high else ()
+        return (f"{draws} alone deny the estimate: by them the probability is at most {number(most, 2)}",)
+    return (f"{draws} alone deny the estimate: by them the probability is at least {number(least, 2)}",) if least > high else ()

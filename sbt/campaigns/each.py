@@ -172,13 +172,15 @@ def estimates_words(estimates: tuple[RequirementEstimate, ...] | None, confidenc
     return [f"Of each requirement, from the same draws{alone} ({percent(confidence)} intervals): {each}."]
 
 
-def shares_words(shares: Mapping[str, CriticalShare] | None) -> list[str]:
-    """Return the share that violates each requirement in words; nothing where there is one."""
+def shares_words(shares: Mapping[str, CriticalShare] | None, of: str = "") -> list[str]:
+    """Return the share (of which runs) that violates each requirement in words; nothing where there is one."""
     each = [
         f"{name} {percent(s.critical_fraction)} ({percent(s.low)} to {percent(s.high)})"
         for name, s in (shares or {}).items() if s.critical_fraction is not None
     ]  # fmt: skip
-    return [f"Violated by: {'; '.join(each)}."] if each else []
+    lost = any(share.lost for share in (shares or {}).values())
+    ends = f"95 % intervals{', whose ends count failed runs as uncritical and as critical' if lost else ''}"
+    return [f"Shares that violate each requirement{of} ({ends}): {'; '.join(each)}."] if each else []
 
 
 def violations_words(counts: Mapping[str, int] | None) -> list[str]:

@@ -221,12 +221,13 @@ def on_warm_ups(found: EstimationConclusion, limits: Limits, traffic: Spread | N
 
 
 def _conclusion(
-    log: Log, probability: float | None, limits: Limits, *, failed: int, warnings: tuple[str, ...] = (), **rest: Any
+    log: Log, probability: float | None, limits: Limits, *, failed: int, beside: int = 0, warnings: tuple[str, ...] = (),
+    **rest: Any,
 ) -> EstimationConclusion:
-    """Return the conclusion with the interval that the limits give; `failed` runs count."""
+    """Return the conclusion with the interval that the limits give; `failed` runs count, those `beside` for the upper one."""
     tail = 0.5 * (1.0 + _CONFIDENCE)
     given = {"failed_as_safe": probability, "failed_as_critical": probability} | rest
-    said = failed_runs(failed, int((~log.history.ok).sum()), len(log.history))
+    said = failed_runs(failed, int((~log.history.ok).sum()), len(log.history), beside)
     return EstimationConclusion(probability, limits.lower(tail), limits.upper(tail), warnings=(*said, *warnings), **given)
 
 
@@ -281,15 +282,15 @@ def _from_batches(log: Log, settings: Settings, seen: Seen | None = None) -> Con
     highest = max(_clipped(high.value), value)
     if not late and (few_low or few_high or hardly_known(value, low.std_error) or hardly_known(highest, high.std_error)):
         limits = limits.within(seen.limits, value, highest)
-        warnings += denied_by_draws(seen, value, highest, 0.5 * (1.0 + _CONFIDENCE))
+        warnings += denied_by_draws(seen.limits, draws, value, highest, 0.5 * (1.0 + _CONFIDENCE))
     if seen.critical:
         others = Unviolated.of(log.history, settings)
         limits = others.reached(limits, lambda c: seen.most(seen.failed, c), seen.most_critical)
         warnings += others.sentences(draws, seen.most(seen.failed, 0.5 * (1.0 + _CONFIDENCE)))
     warnings += cautions(len(safe), low.largest_term, value, seen.surprises)
     return _conclusion(
-        log, value, limits, failed=worst - hits + _failed_beside(log, settings, seen, limits), hits=hits, failed_as_safe=value,
-        cov=low.std_error / low.value if value > 0 else None, effective_sample_size=low.effective_sample_size,
+        log, value, limits, failed=worst - hits, beside=_failed_beside(log, settings, seen, limits), failed_as_safe=value,
+        cov=low.std_error / low.value if value > 0 else None, effective_sample_size=low.effective_sample_size, hits=hits,
         failed_as_critical=max(_clipped(high.value), value) if failing else value,
         undetected_mass_bound=seen.most(seen.surprises, _CONFIDENCE), warnings=tuple(warnings),
         largest_weight_share=low.largest_share,
@@ -299,7 +300,7 @@ def _from_batches(log: Log, settings: Settings, seen: Seen | None = None) -> Con
 
 
 def _failed_beside(log: Log, settings: Settings, seen: Seen, limits: Limits) -> int:
-    """Return how many failed runs beside the draws of an estimate its limits depend on."""
+    """Return how many failed runs beside the draws of an estimate its upper limit depends on."""
     if not seen.failed_apart:
         return 0
     other, tail = _from_batches(log, settings, seen.without_failed_apart)[1], 0.5 * (1.0 + _CONFIDENCE)

@@ -6,12 +6,12 @@ import math
 
 import numpy as np
 
-from sbt.campaigns.wording import percent, plural
+from sbt.campaigns.wording import number, percent, plural
 from sbt.loop.stages import Facts
 
 __all__ = [
-    "decides_bound", "equally_near", "failed_runs", "lost_runs", "nearest_words", "none_gave_a_metric", "nothing_known",
-    "repetitions", "runs_to_halve", "why_they_fail",
+    "decides_bound", "equally_near", "failed_runs", "lost_runs", "narrower", "nearest_words", "none_gave_a_metric",
+    "nothing_known", "repetitions", "runs_to_halve", "why_they_fail",
 ]  # fmt: skip
 
 _HALF = 0.5
@@ -40,17 +40,26 @@ def why_they_fail() -> str:
     return "look at why they failed (table of failed runs in the report, export), mend it, and run the campaign in a new store"
 
 
-def failed_runs(counting: int, failed: int, n: int) -> tuple[str, ...]:
-    """Return how many of n runs failed, and how an estimate counts those that it counts; () where none failed."""
+def failed_runs(counting: int, failed: int, n: int, beside: int = 0) -> tuple[str, ...]:
+    """Return how many of n runs failed, and how an estimate counts those that it counts; () where none failed.
+
+    Args:
+        counting: failed draws of the estimate.
+        failed: failed runs.
+        n: runs.
+        beside: failed draws that only its upper end has.
+    """
     if not failed:
         return ()
     said = f"{failed} of {n} runs failed"
-    if not counting:
+    if not counting + beside:
         return (f"{said}, none of them a draw that counts",)
-    how = "the estimate and its lower end count {} as safe, the upper end as critical"
-    if counting == failed:
-        return (f"{said}: {how.format('them')}",)
-    return (f"{said}: {how.format(f'{counting} of them')}; the others are no draws that count",)
+    rest = "" if counting + beside == failed else "; the others are no draws that count"
+    if not counting:
+        return (f"{said}: the upper end counts {'them' if beside == failed else f'{beside} of them'} as critical{rest}",)
+    safe = "them" if counting == failed else f"{counting} of them"
+    worst = f"{counting + beside} " if beside else ""
+    return (f"{said}: the estimate and its lower end count {safe} as safe, the upper end {worst}as critical{rest}",)
 
 
 def lost_runs(lost: int, n: int) -> str:
@@ -81,6 +90,23 @@ def decides_bound(worst: float, bound: float) -> str | None:
     if worst <= 0.0 or worst < _HALF * bound:
         return None
     return f"failed runs decide the bound, and more runs never lower it much below {percent(worst)}: {why_they_fail()}"
+
+
+def narrower(value: float, worst: float, high: float, more: str) -> str:
+    """Return what lowers the upper end of an interval where runs fail: to mend them, or first more runs.
+
+    Args:
+        value: the estimate.
+        worst: the same with every failed run as critical.
+        high: upper end of the interval.
+        more: what more of would bring the upper end to `worst`, in words.
+    """
+    end, about = number(high, 3), f"{number(worst, 3)}, as far as these tell"
+    if worst < _HALF * (value + high):
+        kept = f"{more} bring the upper end of the interval, {end}, to about {about}, where failed runs keep it"
+        return f"{kept}; {why_they_fail()}"
+    decide = f"failed runs decide the width of the interval: its upper end, {end}, counts them as critical"
+    return f"{decide}, and {more} would bring it to about {about}; {why_they_fail()}"
 
 
 def equally_near(facts: Facts) -> int:

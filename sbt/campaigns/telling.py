@@ -17,6 +17,7 @@ from sbt.campaigns.lost import (
     decides_bound,
     equally_near,
     lost_runs,
+    narrower,
     nearest_words,
     none_gave_a_metric,
     nothing_known,
@@ -347,17 +348,15 @@ def _after_estimation(found: EstimationConclusion, facts: Facts) -> str:
     traffic = found.warmed_traffic
     by_traffic = traffic is not None and traffic.decides(found.cov, found.probability)
     there = int(facts.history.columns["warm_up"].max(initial=-1)) + 1  # those that no counted draw began with among them
-    if worst is not None and worst - found.probability > 2.0 * PRECISE * found.probability:
-        return (
-            f"failed runs decide the width of the interval: its upper end, {number(found.high, 3)}, counts them as critical, and"
-            f" more {'warm-ups (warm_up.seeds), hardly more runs,' if by_traffic else 'runs'} would bring it to about"
-            f" {number(worst, 3)}, as far as these tell; {why_they_fail()}"
-        )
+    gate = None if found.gate is None or found.gate.verdict != "undecided" else found.gate.probability
+    if worst is not None and worst - found.probability > 2.0 * PRECISE * found.probability and not (gate and gate > worst):
+        more = f"more {'warm-ups (warm_up.seeds), hardly more runs,' if by_traffic else 'runs'}"
+        return narrower(found.probability, worst, found.high, more)
     if found.combinations is not None and found.probability == 0.0:
         return "ten times as many runs bring the upper end of the interval to a tenth"
     if all_critical(facts):
         return widening(facts.recorded)
-    if found.gate is not None and found.gate.verdict == "undecided":
+    if gate is not None:
         ends = f", with stop: {{cov: null}} as the campaign ends at {percent(PRECISE)} of the estimate otherwise"
         ends = ends if found.cov is not None and found.cov <= PRECISE else ""
         return f"a larger budget than {n:,} runs{ends}: it narrows the interval until it lies on one side of the gate"

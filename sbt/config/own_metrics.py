@@ -104,5 +104,6 @@ def metrics_of_several(of_each: Mapping[str, Metric]) -> tuple[Metric, ...]:
 
 def _while_present(metric: Metric, ego: str, trace: Trace) -> float:
     """Return the metric from the arrival of its vehicle on the road to its end; `without` where it never was there."""
+    trace = trace.seen_by(ego)
     at = np.flatnonzero(trace.present[:, trace.actors.index(ego)]) if ego in trace.actors else np.empty(0, dtype=int)
     return metric.value(trace.select(slice(int(at[0]), int(at[-1]) + 1))) if len(at) else metric.without

@@ -157,7 +157,7 @@ class OthersEntry(_Strict):
     """Who is recorded beside the ego."""
 
     within: float = Field(default=100.0, gt=0, description="Radius around the ego's body (m).")
-    named: Names = Field(default=(), description="Ids recorded wherever they are.")
+    named: Names = Field(default=(), description="Ids recorded at any distance, on the ego's level.")
 
 
 class MetricEntry(_Open):

@@ -135,9 +135,12 @@ def sentences_of(conclusion: Conclusion, facts: Facts) -> list[str]:
     said = conclusion.sentences(facts)
     violating = _violating(facts)
     if said and violating:
-        which = f"{len(violating):,} of the runs that failed (such as run {violating[0]}) are critical by what they gave"
-        rule = "they count as failed, not as critical: give the metric that was no number a value for where there is none"
-        said = [*said[:3], f"{which}; {rule}.", *said[3:]]
+        which = f"Run {violating[0]}, which failed, is critical by what it gave; it counts"
+        if len(violating) > 1:
+            such = f"{len(violating):,} of the runs that failed (such as run {violating[0]})"
+            which = f"{such} are critical by what they gave; they count"
+        rule = "as failed, not as critical: give the metric that was no number a value for where there is none"
+        said = [*said[:3], f"{which} {rule}.", *said[3:]]
     odd = int(facts.history.doubtful(Doubt.IMPOSSIBLE).sum())
     if said and odd:
         which = f"In {odd:,} of {len(facts.history):,} runs the ego moves as no vehicle can"

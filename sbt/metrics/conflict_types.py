@@ -92,6 +92,7 @@ def conflict(trace: Trace, ego: str, decisive: Sequence[Decisive] = ()) -> tuple
         None: nobody is within 1 km.
     """
     ego = ego if ego in trace.actors else trace.actors[0]
+    trace = trace.seen_by(ego)
     others = _nearest_first(trace, ego)
     decided = _decided(trace, ego, list(others), decisive) if others else None
     if decided is not None:

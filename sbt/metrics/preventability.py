@@ -50,6 +50,7 @@ def applicability(ego: str = "ego", decisive: Sequence[Decisive] = (), also_test
 
 
 def _code(trace: Trace, ego: str, decisive: Sequence[Decisive]) -> float:
+    trace = trace.seen_by(ego)
     met = conflict(trace, ego, decisive)
     if met is None:
         return float(_NOBODY)

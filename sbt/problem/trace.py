@@ -107,6 +107,8 @@ class Trace:
         unconfirmed: contacts on which geometry and SUMO's own list differ, and what differs (`sbt.sumo.contacts`); other doubts.
         unreacting: actors that are moved as they were recorded, whatever happens.
         flat: actors that are driven over, such as what hides a marking: films show them, metrics do not see them.
+        seen: of several vehicles under test: name to what each came upon, its own trace. Who is too far from it, or on another
+            level, is not there.
         ballistic: speeds change evenly within a step (SUMO's option `step-method.ballistic`), else in jumps at its begin.
         view: where the sensor of the first actor sees something, for films (not compared); None: unknown.
 
@@ -137,6 +139,7 @@ class Trace:
     view: FieldOfView | None = None
     flat: tuple[str, ...] = ()
     ballistic: bool = False
+    seen: Mapping[str, Trace] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         shape = (len(self.time), len(self.actors))
@@ -194,7 +197,7 @@ class Trace:
         some = Trace(
             self.time[i], tuple(new.values()), self.x[i][:, at], self.y[i][:, at], self.heading[i][:, at], self.speed[i][:, at],
             self.acceleration[i][:, at], self.length[at], self.width[at], self.ended, ways=ways, parts=parts,
-            ballistic=self.ballistic,
+            ballistic=self.ballistic, seen=self._seen(i, new),
         )  # fmt: skip
         if actors is not None:
             return some
@@ -203,6 +206,19 @@ class Trace:
             some, reported=self.reported, signals=signals, unconfirmed=self.unconfirmed, unreacting=self.unreacting,
             view=self.view, flat=self.flat,
         )  # fmt: skip
+
+    def seen_by(self, ego: str) -> Trace:
+        """Return what a vehicle under test came upon: the trace itself, where there is but one."""
+        return self.seen.get(ego, self)
+
+    def _seen(self, i: slice, new: Mapping[str, str]) -> dict[str, Trace]:
+        """Return what the vehicles under test came upon at some instants, of some actors under new names."""
+        found, times = {}, self.time[i]
+        for ego, trace in self.seen.items():
+            if ego in new and len(times):
+                rows = slice(*np.searchsorted(trace.time, (times[0], np.nextafter(times[-1], np.inf))).tolist())
+                found[new[ego]] = trace.select(rows, {name: new[name] for name in trace.actors if name in new})
+        return found
 
     @property
     def measured(self) -> Trace:
@@ -235,6 +251,8 @@ class Trace:
         same = same and all(np.array_equal(way, other.ways[name], equal_nan=True) for name, way in self.ways.items())
         texts = ("actors", "ended", "reported", "unconfirmed", "unreacting", "flat", "ballistic")
         same = same and all(getattr(self, name) == getattr(other, name) for name in texts)
+        same = same and self.seen.keys() == other.seen.keys()
+        same = same and all(trace.identical(other.seen[ego]) for ego, trace in self.seen.items())
         return same and self.parts.keys() == other.parts.keys() and self._part_states() == other._part_states()
 
     def _part_states(self) -> list[bytes]:

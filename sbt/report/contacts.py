@@ -38,7 +38,7 @@ def contacts_of(trace: Trace) -> tuple[Contact, ...]:
     What never moves and does not end the run that touches it, such as a bar that hides a marking, is no road user.
     """
     ego = trace.actors[0]
-    found = []
+    trace, found = trace.seen_by(ego), []
     for j, other in enumerate(trace.actors[1:], start=1):
         if trace.ended != "collision" and not np.nanmax(trace.speed[:, j], initial=0.0) > 0.0:
             continue

@@ -135,6 +135,7 @@ class Recorder:
         self._listed: dict[str, float] = {}
         self._differing: dict[str, str] = {}
         self._struck: list[str] = []
+        self._touched: list[tuple[str, ActorTrace, ActorTrace]] = []
         self._ended: RunEnded | None = None
         self._steps = 0
         self._timeout = timeout
@@ -189,12 +190,23 @@ class Recorder:
             self._control.step(self._t, near.states[self._ego], others)
 
     def after_step(self) -> None:
-        """Record the step.
+        """Record the step, and judge it.
 
         Raises:
             RunEnded: the run is over.
             RunError: the ego is not where it should be, or the wall-clock limit is exceeded.
         """
+        self.record_step()
+        self.judge_step()
+
+    def record_step(self) -> None:
+        """Record the states, SUMO's list of collisions, and who touches the ego.
+
+        Raises:
+            RunEnded: the ego has left, maybe in a contact.
+            RunError: the ego is not where it should be, or the wall-clock limit is exceeded.
+        """
+        self._touched = []
         self._check_clock()
         simulation = self._sumo.simulation
         departed, arrived = frozenset(simulation.getDepartedIDList()), frozenset(simulation.getArrivedIDList())
@@ -211,7 +223,28 @@ class Recorder:
             raise RunError(Status.INVALID, f"the ego '{self._ego}' must stay on its way, but SUMO teleported it at {self._now()}")
         if self._ego in arrived and len(self._surroundings):
             self._handle_arrival()
-        self._record_step(departed)
+        near = self._surroundings
+        near.record()
+        if not self._walks and self._ego not in near.rigid:
+            self._leaving.look()
+        self._appearances.after_step(near, departed)
+        self._touched = near.touching()
+        if simulation.getCollidingVehiclesNumber():
+            self._record_collisions({name for name, *_ in self._touched})
+
+    def judge_step(self) -> None:
+        """End the run at a contact of the ego, which takes further steps of SUMO, or when its time is over.
+
+        Raises:
+            RunEnded: the run is over.
+            RunError: the contact is that of one who has just been moved there.
+        """
+        if self._touched:
+            self._appearances.refuse_contact(self._touched[0][0])
+            self._judge(self._touched)
+            self._end("collision")
+        if self._t >= self._settings.duration - 0.5 * self._dt:
+            self._end("duration")
 
     def _with_ego_on_foot(self, departed: frozenset[str], arrived: frozenset[str]) -> tuple[frozenset[str], frozenset[str]]:
         """Return who departed and arrived in this step, with the ego if it is a person."""
@@ -275,23 +308,6 @@ class Recorder:
             self._differing[found.other] = unknown_end(found.other, self._t)
         self._note_struck([one for one in near.touching() if one[0] == found.other])
         self._end("collision")
-
-    def _record_step(self, departed: frozenset[str]) -> None:
-        """Record the states, SUMO's list of collisions, and contacts; end the run at a contact of the ego."""
-        near = self._surroundings
-        near.record()
-        if not self._walks and self._ego not in near.rigid:
-            self._leaving.look()
-        self._appearances.after_step(near, departed)
-        touched = near.touching()
-        if self._sumo.simulation.getCollidingVehiclesNumber():
-            self._record_collisions({name for name, *_ in touched})
-        if touched:
-            self._appearances.refuse_contact(touched[0][0])
-            self._judge(touched)
-            self._end("collision")
-        if self._t >= self._settings.duration - 0.5 * self._dt:
-            self._end("duration")
 
     def _record_collisions(self, touched: set[str]) -> None:
         """Record what SUMO lists in this step, and what differs where the bodies of a listed pair do not touch."""

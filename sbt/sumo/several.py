@@ -119,16 +119,24 @@ class Recorders:
             RunError: one of them is not where it should be, or the wall-clock limit is exceeded.
         """
         end: RunEnded | None = None
+        recorded = []
         for name, recorder in [("", self._first), *self._watching.items()]:
             try:
-                recorder.after_step()
+                recorder.record_step()
             except RunEnded as found:
                 if name and found.reason == "left":
                     del self._watching[name]
                     continue
                 end = found
-                if found.reason == "collision":  # it may have been looked at for further steps: the others record no more
-                    break
+            else:
+                recorded.append(recorder)
+        for recorder in recorded:
+            if end is not None and end.reason == "collision":  # SUMO may no longer be at this step
+                break
+            try:
+                recorder.judge_step()
+            except RunEnded as found:
+                end = found
         if end is not None:
             self._ended = end.reason
             raise end
@@ -143,6 +151,8 @@ class Recorders:
         first = self._first.trace(ended)
         if late or self._first.began is None:
             raise RunError(Status.INVALID, f"'{late[0]}' is under test and must depart while '{first.actors[0]}' is, but did not")
+        if not self._further:
+            return first
         others = [(recorder.trace(ended), (recorder.began or 0) - self._first.began) for recorder in self._further.values()]
         return _merged(first, others)
 
@@ -154,11 +164,13 @@ def _merged(first: Trace, others: Sequence[tuple[Trace, int]]) -> Trace:
     table = {state: np.full((n, len(names)), np.nan) for state in _STATES}
     size = {name: (math.nan, math.nan) for name in names}
     parts: dict[str, tuple[ActorTrace, ...]] = {}
+    seen: dict[str, Trace] = {}
     for trace, begin in [(first, 0), *others]:
         rows = slice(max(begin, 0), min(begin + len(trace.time), n))
         taken = slice(max(-begin, 0), max(-begin, 0) + rows.stop - rows.start)
         if rows.stop <= rows.start:
             continue
+        seen[trace.actors[0]] = replace(trace.select(taken), time=first.time[rows])
         for k, name in enumerate(trace.actors):
             j, size[name] = names.index(name), (float(trace.length[k]), float(trace.width[k]))
             for state, values in table.items():
@@ -171,7 +183,7 @@ def _merged(first: Trace, others: Sequence[tuple[Trace, int]]) -> Trace:
     return replace(
         first, actors=tuple(names), x=table["x"], y=table["y"], heading=table["heading"], speed=table["speed"],
         acceleration=table["acceleration"], length=np.array([size[name][0] for name in names]),
-        width=np.array([size[name][1] for name in names]), parts=parts, unconfirmed=unconfirmed,
+        width=np.array([size[name][1] for name in names]), parts=parts, unconfirmed=unconfirmed, seen=seen,
     )  # fmt: skip
 
 
