@@ -99,6 +99,26 @@ def test_an_input_that_is_gone_is_integrated_or_fixed(tmp_path):
         transfer_of(before, runs, after, GaussianProcess(), 1, {"wett": 0.0})
 
 
+@pytest.mark.parametrize("kind", ["distance", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("flag", "count"))])
+def test_metrics_that_end_or_come_in_steps_are_learned_as_ever(tmp_path, kind):
+    """As a trend, a distance of 0 in every collision made half of all that is critical uncritical: 3 of 7 intervals missed."""
+    told = {"distance": lambda y: max(y, 0.0), "flag": lambda y: y > 0.0, "count": lambda y: np.clip(np.ceil(3.0 * y), 0, 9)}
+
+    def ending(name: str, beta: float) -> sbt.Scenario:
+        plain = scenario(name, beta)
+        return sbt.Scenario(
+            name, inputs=plain.space.parameters, requirement=sbt.Requirement("y", high=0.0),
+            evaluate=lambda values, seed: {"y": float(told[kind](plain.evaluate(values, seed)["y"]))},
+        )  # fmt: skip
+
+    run(tmp_path / "old", ending("before", 2.0), stop={"cov": None}, budget=120)
+    warm = {"store": str(tmp_path / "old"), "transfer": True}
+    found = run(tmp_path / "new", ending("after", 2.2), warm_start=warm, stop={"cov": None}, budget=70).conclusion
+    assert found.low <= norm.sf(2.2) <= found.high
+    assert found.probability == pytest.approx(norm.sf(2.2), rel=0.1 if kind == "distance" else 0.35)
+    assert found.high - found.low < (0.5 if kind == "distance" else 1.2) * norm.sf(2.2)
+
+
 def test_what_cannot_be_transferred_is_refused(old, tmp_path):
     with pytest.raises(sbt.InputError, match="an input in common"):
         run(tmp_path / "a", "testbed:linear_d2", warm_start={"store": str(old), "transfer": True})

@@ -25,7 +25,7 @@ from sbt.problem.outcome import Job, Status
 from sbt.problem.plain import Json, JsonMapping
 from sbt.samplers.search import DEFLATION
 from sbt.seeds import run_seed
-from sbt.store.database import Store
+from sbt.store.database import DATABASE, Store
 from sbt.workflows.running import run_study
 from sbt.workflows.study import Study
 
@@ -74,8 +74,8 @@ def compare(
         listener: called after every cell.
 
     Raises:
-        InputError: not a falsification, no or an unknown sampler, recorded rows, a combined requirement, or a library that is not
-            installed.
+        InputError: not a falsification, no or an unknown sampler, recorded rows, a combined requirement, a library that is not
+            installed, or a folder that is the store of a campaign.
     """
     config = loaded.config
     if config.campaign != "falsification":
@@ -88,6 +88,8 @@ def compare(
             OUTSIDE[name](2, config.seed, config.initial, CONTINUOUS)
     if scenario_of(loaded).requirement.combined:
         raise InputError(f"compare needs a requirement on one metric, but got {scenario_of(loaded).requirement.metric}")
+    if (folder / DATABASE).is_file():
+        raise InputError(f"compare needs a folder of its own (--into), but {folder} is the store of a campaign")
     if scenario_of(loaded).pool is not None:
         raise InputError("compare needs a scenario that can be simulated, but got recorded rows")
     folder.mkdir(parents=True, exist_ok=True)
@@ -192,7 +194,7 @@ def table(cells: Sequence[Cell]) -> str:
         mine = [cell for cell in cells if cell.sampler == name]
         budget = mine[0].budget
         first = np.array([1e9 if c.runs_to_first is None else c.runs_to_first for c in mine])
-        shown = [f"{v:.0f}" if v <= budget else f"> {budget}" for v in np.quantile(first, (0.5, 0.9))]
+        shown = [f"{v:.1f}".removesuffix(".0") if v <= budget else f"> {budget}" for v in np.quantile(first, (0.5, 0.9))]
         found, distinct = np.mean(first <= budget), np.mean([c.distinct for c in mine])
         seconds = np.median([c.seconds for c in mine])
         told = f"{name} | {len(mine)} | {100 * found:.0f} % | {shown[0]} | {shown[1]} | {distinct:.1f} | {seconds:.2g}"

@@ -10,6 +10,7 @@ from sbt.errors import InputError, did_you_mean
 from sbt.estimators.transfer import Transfer, Trend
 from sbt.loop.earlier import EarlierRuns
 from sbt.metamodels.base import Metamodel, fitted, named_errors, predicted
+from sbt.metamodels.saturation import opened
 from sbt.metamodels.warp import Warp
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.parameter import Parameter
@@ -158,6 +159,7 @@ def _trend(
     runs, y = runs.where(np.isfinite(y)), y[np.isfinite(y)]
     if len(y) < 2:
         raise InputError(f"warm_start.transfer needs at least two runs with {part.metric}, but got {len(y)}")
+    y = opened(_inputs(old, runs.x), y, part.critical, rng)
     warp = Warp.around_edge(y, part.critical, quantile=_QUANTILE)
     t = warp.values(y)
     if len(t) > _ROWS:

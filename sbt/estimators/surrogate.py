@@ -25,6 +25,7 @@ from sbt.metamodels.censored import Limit, beyond
 from sbt.metamodels.gaps import better_without_gap
 from sbt.metamodels.joint import joined_log_probability
 from sbt.metamodels.prediction import Prediction
+from sbt.metamodels.rounded import in_steps
 from sbt.metamodels.saturation import on_side, opened_and_limit
 from sbt.metamodels.stacking import cell_shares, surely_positive
 from sbt.metamodels.tails import student_mixture
@@ -257,7 +258,8 @@ def fit_log_probability(
 
     Held-out runs near the boundary tell in which form the metric is predicted best: warped or as it is, whole or without a
     trend. A trend that wins by far is trusted alone; else the larger P of two fits counts. What an earlier campaign knows is a
-    trend; of a very noisy simulator it is one more input instead, so that noise is learned as ever.
+    trend; of a very noisy simulator, or a metric that ends or comes in steps, it is one more input instead, so that these are
+    learned as ever.
 
     Args:
         metamodel: learns the metric.
@@ -282,15 +284,17 @@ def fit_log_probability(
     u = coordinates(z)
     y = on_side(u, y, critical)
     critical, least = as_passed(critical, y), noise[0] if noise else 0.0
-    if earlier and math.sqrt(least) > _NOISE_COUNTS * earlier[0].warp.scale and len(y) >= _FEWEST_SCORED:
+    measured, (y, limit) = y, opened_and_limit(u, y, critical, rng)
+    noisy = bool(earlier) and math.sqrt(least) > _NOISE_COUNTS * earlier[0].warp.scale
+    if earlier and len(y) >= _FEWEST_SCORED and (noisy or limit is not None or in_steps(u, measured, critical)):
         coordinates = earlier[0].beside(coordinates)
         u = coordinates(z)
+        y, limit = opened_and_limit(u, measured, critical, rng)
     elif earlier:
         warp = earlier[0].warp
         belief, edges = trended(metamodel, earlier[0], u, z, warp.values(y), rng), warp.interval(critical)
         if belief is not None:
             return lambda points: belief(coordinates(points), points).log_probability(edges)
-    y, limit = opened_and_limit(u, y, critical, rng)
     better = _better_warp(metamodel, u, y, critical)
     warp = better or Warp.around_edge(y, critical, quantile=_QUANTILE)
     t = warp.values(y)

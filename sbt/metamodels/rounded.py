@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
-from sbt.metamodels.base import Metamodel, gives_different
+from sbt.metamodels.base import Metamodel, gives_different, is_flag
 from sbt.metamodels.censored import Limit
 from sbt.metamodels.expectation_propagation import Belief, Hyper, Priors, believe, fitted, latent, latent_paths
 from sbt.metamodels.prediction import Prediction
@@ -25,8 +25,8 @@ from sbt.problem.arrays import Mask, Points, Vector
 from sbt.problem.requirement import CriticalInterval
 
 __all__ = [
-    "RoundedPredictor", "Rounding", "StepAware", "better_rounded", "beyond_ranges", "rounded_process", "rounding", "two_ranges",
-    "without_unit",
+    "RoundedPredictor", "Rounding", "StepAware", "better_rounded", "beyond_ranges", "in_steps", "rounded_process", "rounding",
+    "two_ranges", "without_unit",
 ]  # fmt: skip
 
 _FEWEST, _TIED = 10, 0.5
@@ -79,6 +79,11 @@ class StepAware(Protocol):
     def with_rounding(self, told: Rounding) -> Metamodel:
         """Return the same settings for rows of which each tells a range."""
         ...
+
+
+def in_steps(u: Points, y: Vector, critical: CriticalInterval) -> bool:
+    """Say whether y (n,) at u (n, d) has few values: two, one of them critical, or steps over which it is the same."""
+    return len(y) > 0 and (is_flag(y, critical) or rounding(u, y, critical) is not None)
 
 
 def rounding(u: Points, y: Vector, critical: CriticalInterval) -> Rounding | None:

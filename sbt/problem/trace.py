@@ -197,7 +197,7 @@ class Trace:
         some = Trace(
             self.time[i], tuple(new.values()), self.x[i][:, at], self.y[i][:, at], self.heading[i][:, at], self.speed[i][:, at],
             self.acceleration[i][:, at], self.length[at], self.width[at], self.ended, ways=ways, parts=parts,
-            ballistic=self.ballistic, seen=self._seen(i, new),
+            ballistic=self.ballistic, seen=self._seen(i, actors),
         )  # fmt: skip
         if actors is not None:
             return some
@@ -211,13 +211,15 @@ class Trace:
         """Return what a vehicle under test came upon: the trace itself, where there is but one."""
         return self.seen.get(ego, self)
 
-    def _seen(self, i: slice, new: Mapping[str, str]) -> dict[str, Trace]:
-        """Return what the vehicles under test came upon at some instants, of some actors under new names."""
+    def _seen(self, i: slice, actors: Mapping[str, str] | None) -> dict[str, Trace]:
+        """Return what the vehicles under test came upon at some instants, of all actors or of some under new names."""
         found, times = {}, self.time[i]
-        for ego, trace in self.seen.items():
-            if ego in new and len(times):
-                rows = slice(*np.searchsorted(trace.time, (times[0], np.nextafter(times[-1], np.inf))).tolist())
-                found[new[ego]] = trace.select(rows, {name: new[name] for name in trace.actors if name in new})
+        for ego, trace in self.seen.items() if len(times) else ():
+            rows = slice(*np.searchsorted(trace.time, (times[0], np.nextafter(times[-1], np.inf))).tolist())
+            if actors is None:
+                found[ego] = trace.select(rows)
+            elif ego in actors:
+                found[actors[ego]] = trace.select(rows, {name: actors[name] for name in trace.actors if name in actors})
         return found
 
     @property
