@@ -335,7 +335,7 @@ def test_limits_of_an_estimate_that_random_draws_deny_end_at_it():
         assert 0.0 < found.lower(0.975) < 0.001
         assert found.upper(0.975) == pytest.approx(max(value, binomial.upper(1, 85, 0.9875)))
         assert hardly_known(value, 0.98 * value)
-        assert bool(denied_by_draws(seen, value, value, 0.975)) == (value == 0.19)
+        assert bool(denied_by_draws(seen.limits, "85 draws", value, value, 0.975)) == (value == 0.19)
     assert not hardly_known(0.19, 0.05)
     assert hardly_known(0.97, 0.02)
 
