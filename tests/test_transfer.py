@@ -99,10 +99,10 @@ def test_an_input_that_is_gone_is_integrated_or_fixed(tmp_path):
         transfer_of(before, runs, after, GaussianProcess(), 1, {"wett": 0.0})
 
 
-@pytest.mark.parametrize("kind", ["distance", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("flag", "count"))])
+@pytest.mark.parametrize("kind", ["distance", pytest.param("count", marks=pytest.mark.slow)])
 def test_metrics_that_end_or_come_in_steps_are_learned_as_ever(tmp_path, kind):
     """As a trend, a distance of 0 in every collision made half of all that is critical uncritical: 3 of 7 intervals missed."""
-    told = {"distance": lambda y: max(y, 0.0), "flag": lambda y: y > 0.0, "count": lambda y: np.clip(np.ceil(3.0 * y), 0, 9)}
+    told = {"distance": lambda y: max(y, 0.0), "count": lambda y: np.clip(np.ceil(3.0 * y), 0, 9)}
 
     def ending(name: str, beta: float) -> sbt.Scenario:
         plain = scenario(name, beta)
@@ -115,7 +115,7 @@ def test_metrics_that_end_or_come_in_steps_are_learned_as_ever(tmp_path, kind):
     warm = {"store": str(tmp_path / "old"), "transfer": True}
     found = run(tmp_path / "new", ending("after", 2.2), warm_start=warm, stop={"cov": None}, budget=70).conclusion
     assert found.low <= norm.sf(2.2) <= found.high
-    assert found.probability == pytest.approx(norm.sf(2.2), rel=0.1 if kind == "distance" else 0.35)
+    assert found.probability == pytest.approx(norm.sf(2.2), rel=0.1 if kind == "distance" else 0.3)
     assert found.high - found.low < (0.5 if kind == "distance" else 1.2) * norm.sf(2.2)
 
 
