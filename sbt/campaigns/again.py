@@ -53,7 +53,6 @@ _FAR = 30.0
 """Normal score beyond which there is nothing to propose."""
 _RATIOS = 2**13
 """Draws from the new distribution, which tell how much less of the old one there is."""
-_UNSEEN = Seen(0, 0, 0, 0, 0, 0, 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,8 +86,8 @@ class Reused:
     safe: int
     warm_up: Vector
     least: float
-    taught: int = 0
-    seen: Seen = _UNSEEN
+    taught: int
+    seen: Seen
     unviolated: Unviolated = field(default_factory=Unviolated)
 
     @property
@@ -104,9 +103,7 @@ class Reused:
     def limits(self) -> Limits:
         """Limits by the draws from the campaign's distribution alone, failed ones as safe below and as critical above."""
         seen = self.seen
-        return Limits(
-            lambda c: 1.0 - self.most(seen.draws - seen.hits, c), lambda c: self.most(seen.hits + seen.failed, c)
-        )
+        return Limits(lambda c: 1.0 - self.most(seen.draws - seen.hits, c), lambda c: self.most(seen.hits + seen.failed, c))
 
 
 def reused(log: Log, settings: Settings, space: ParameterSpace, own: Requirement) -> Reused:
