@@ -13,9 +13,8 @@ from scipy.stats import binomtest, norm
 from typer.testing import CliRunner
 
 import sbt
-from sbt.campaigns.again import Reused
+from sbt.campaigns.again import Reused, SeenAgain
 from sbt.campaigns.asking import answer
-from sbt.campaigns.counting import Seen
 from sbt.cli import app
 from sbt.estimators.reweighting import ReusedBatch, WeightedShare, defended_bound, few_hits_bound
 from sbt.problem.sensitivity import space_parameters
@@ -161,8 +160,8 @@ def test_failed_draws_are_safe_below_where_all_others_are_critical():
     x, critical = np.full((20, 1), 0.5), np.repeat([1.0, 0.0], [15, 5])
     safe, worst = (ReusedBatch(x, np.ones(20), np.zeros(20), hits) for hits in (critical, np.ones(20)))
     for crude in (False, True):
-        seen = Seen(critical=15, safe=0, draws=20, hits=15, failed=5, surprises=0, known=15)
-        found = answer(Reused(space, (safe,), (worst,), 5, np.ones(20), np.ones(9), crude, 15, 0, np.full(20, -1), 3.0, 0, seen))
+        seen = SeenAgain(15, 0, 20, 15, 5, 0, 15, nominal=np.ones(20), ratio=np.ones(9))
+        found = answer(Reused(space, (safe,), (worst,), 5, np.ones(20), crude, np.full(20, -1), 3.0, seen))
         assert found.probability == 0.75
         assert binomtest(15, 20).proportion_ci().low == pytest.approx(found.low, rel=0.02)
         assert found.high == 1.0
@@ -174,10 +173,9 @@ def test_failed_draws_that_a_metamodel_chose_are_not_held_against_draws_that_it_
     space = sbt.Scenario("s", inputs, sbt.Requirement("y", low=0.0), evaluate=lambda v, s: {"y": 0.0}).space
     x, weight, nominal = np.full((50, 1), 0.5), np.repeat([2.0, 0.3], [20, 30]), np.repeat([1.0, 0.0], [20, 30])
     safe, worst = (ReusedBatch(x, weight, np.zeros(50), np.repeat([0.0, failed], [37, 13])) for failed in (0.0, 1.0))
-    seen = Seen(critical=3, safe=47, draws=20, hits=0, failed=0, surprises=0, known=3)
-    given, warm_up = (nominal, np.ones(9)), np.full(50, -1)
     for critical in (3, 0):
-        found = answer(Reused(space, (safe,), (worst,), 13, *given, False, critical, 47, warm_up, 3.0, 0, seen))
+        seen = SeenAgain(critical, 47, 20, 0, 0, 0, 3, nominal=nominal, ratio=np.ones(9))
+        found = answer(Reused(space, (safe,), (worst,), 13, nominal, False, np.full(50, -1), 3.0, seen))
         assert (found.probability, found.low) == (0.0, 0.0)
         assert found.failed_as_critical == pytest.approx(13 * 0.3 / 50)
         assert found.failed_as_critical < found.high < 0.25

@@ -15,7 +15,6 @@ from threadpoolctl import threadpool_limits
 
 from sbt.campaigns.counting import DENIED, DRAWN, NOMINAL, Seen
 from sbt.campaigns.crude import nominal_rows, took_monte_carlo
-from sbt.campaigns.gate import Limits
 from sbt.campaigns.known import Known
 from sbt.campaigns.pools import Frame, admitted, most_nominal, sample_mixture
 from sbt.campaigns.records import EstimationProposal
@@ -37,7 +36,7 @@ from sbt.problem.space import ParameterSpace
 from sbt.seeds import stream
 from sbt.store.history import History
 
-__all__ = ["FLOOR", "Reused", "reused"]
+__all__ = ["FLOOR", "Reused", "SeenAgain", "reused"]
 
 Rows = NDArray[np.intp]
 
@@ -55,6 +54,23 @@ _RATIOS = 2**13
 """Draws from the new distribution, which tell how much less of the old one there is."""
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SeenAgain(Seen):
+    """What all runs met where another distribution has mass, and what the draws from the campaign's distribution met.
+
+    Attributes:
+        nominal: share of each draw in proportion to the campaign's distribution, of those that taught as well.
+        ratio: (m,) new over old density at draws from the new one.
+    """
+
+    nominal: Vector
+    ratio: Vector
+
+    def most(self, hits: int, confidence: float) -> float:
+        """Return the upper limit of the probability of what the draws from the campaign's distribution met so many times."""
+        return defended_bound(hits, self.nominal, self.ratio, confidence)
+
+
 @dataclass(frozen=True, eq=False)
 class Reused:
     """The counted draws of an estimation, weighted for another distribution of the inputs.
@@ -65,13 +81,10 @@ class Reused:
         worst: the same with every failed draw as critical.
         failed: draws that failed.
         nominal: (n,) share of each draw in proportion to the campaign's distribution.
-        ratio: (m,) new over old density at draws from the new one.
         crude: the draws come from the campaign's distribution itself.
-        critical, safe: runs of the whole campaign where the new distribution has mass.
         warm_up: (n,) that each draw began with, -1 without one.
         least: effective sample size below which the draws say nothing.
-        taught: further draws from the campaign's distribution, which taught and do not count.
-        seen: what all draws from the campaign's distribution met.
+        seen: what the runs met where the new distribution has mass, and all draws from the campaign's distribution.
         unviolated: requirements that no run violated.
     """
 
@@ -80,30 +93,11 @@ class Reused:
     worst: tuple[ReusedBatch, ...]
     failed: int
     nominal: Vector
-    ratio: Vector
     crude: bool
-    critical: int
-    safe: int
     warm_up: Vector
     least: float
-    taught: int
-    seen: Seen
+    seen: SeenAgain
     unviolated: Unviolated = field(default_factory=Unviolated)
-
-    @property
-    def unmet(self) -> Vector:
-        """The share of each draw that is in proportion to the campaign's distribution, of those that taught as well."""
-        return np.concatenate([self.nominal, np.ones(self.taught)])
-
-    def most(self, hits: int, confidence: float) -> float:
-        """Return the upper limit of the probability of what the draws from the campaign's distribution met so many times."""
-        return defended_bound(hits, self.unmet, self.ratio, confidence)
-
-    @property
-    def limits(self) -> Limits:
-        """Limits by the draws from the campaign's distribution alone, failed ones as safe below and as critical above."""
-        seen = self.seen
-        return Limits(lambda c: 1.0 - self.most(seen.draws - seen.hits, c), lambda c: self.most(seen.hits + seen.failed, c))
 
 
 def reused(log: Log, settings: Settings, space: ParameterSpace, own: Requirement) -> Reused:
@@ -144,13 +138,14 @@ def reused(log: Log, settings: Settings, space: ParameterSpace, own: Requirement
     nominal = np.concatenate([1.0 * (np.arange(len(d.rows)) < d.nominal) for d in draws])
     seen, others = Seen.of(log, settings, own), hits[every] & ~own.critical_runs(history)[every] & (nominal > 0.0)
     denied = np.concatenate([np.full(len(d.rows), said[0].denied) for d, said in zip(draws, predicted, strict=True)])
+    taught = 0 if plainly else seen.draws - round(float(nominal.sum()))
+    met = SeenAgain(
+        int((hits & reached).sum()), int((history.ok & ~hits & reached).sum()), seen.draws, seen.hits, seen.failed,
+        seen.surprises + int((others & denied).sum()), seen.known, seen.late and not plainly, seen.failed_apart,
+        nominal=np.concatenate([nominal, np.ones(taught)]), ratio=np.exp(space.log_density(x) - old.log_density(x)),
+    )  # fmt: skip
     return Reused(
-        space, batches, worst, int((~history.ok[every]).sum()), nominal,
-        np.exp(space.log_density(x) - old.log_density(x)), crude,
-        int((hits & reached).sum()), int((history.ok & ~hits & reached).sum()),
-        history.columns["warm_up"][every], least,
-        0 if plainly else seen.draws - round(float(nominal.sum())),
-        replace(seen, surprises=seen.surprises + int((others & denied).sum()), late=seen.late and not plainly),
+        space, batches, worst, int((~history.ok[every]).sum()), nominal, crude, history.columns["warm_up"][every], least, met,
         Unviolated.of(history, settings),
     )  # fmt: skip
 

@@ -7,13 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sbt.campaigns.again import Reused
+from sbt.campaigns.batches import told_by_batches
 from sbt.campaigns.clustering import spread_of_batches
-from sbt.campaigns.counting import FEW_KNOWN, at_least, denied_by_draws, denied_late, hardly_known
+from sbt.campaigns.counting import nothing_critical
 from sbt.campaigns.estimation import Concluded, EstimationConclusion, on_warm_ups
 from sbt.campaigns.gate import Limits
-from sbt.campaigns.precision import cautions
-from sbt.campaigns.wording import plural
-from sbt.estimators.intervals import FEW_HITS, CountedBatch, combine_estimates
+from sbt.estimators.intervals import CountedBatch, combine_estimates
 from sbt.estimators.reweighting import ReusedBatch, WeightedShare, defended_bound, effective_size
 from sbt.problem.arrays import Points, Vector
 from sbt.problem.sensitivity import SpaceParameter, space_parameters
@@ -23,7 +22,6 @@ __all__ = ["Sensitivity", "answer", "sensitivities"]
 _CONFIDENCE = 0.95
 _HEAVY = 0.25
 """Share of the weight that one draw may carry before the reader is warned."""
-_NONE_SAFE = "no counted draw was safe: only a lower bound is given"
 
 
 @dataclass(frozen=True)
@@ -70,66 +68,31 @@ def answer(found: Reused) -> EstimationConclusion:
 
 def _from_batches(found: Reused) -> Concluded:
     """Return what batches with a control variate say."""
-    safe, worst = [_weighted(b) for b in found.batches], [_weighted(b) for b in found.worst]
-    low, high = combine_estimates(safe), combine_estimates(worst)
-    hits, perhaps, misses = sum(b.hits for b in safe), sum(b.hits for b in worst), sum(b.misses for b in worst)
-    not_hits = sum(b.misses for b in safe)
-    seen, drawn, draws = found.seen, found.limits, f"{plural(found.seen.draws, 'draw')} from the campaign's distribution"
-    few_low, few_high = min(hits, not_hits) < FEW_HITS, min(perhaps, misses) < FEW_HITS
-    value, exact, warnings = min(max(low.value, 0.0), 1.0), None, []
-    limits = Limits(lambda c: low.limit(c, side=-1, few=few_low), lambda c: high.limit(c, side=1, few=few_high))
-    if not found.critical:
-        value, limits = 0.0, Limits(lambda _: 0.0, drawn.upper)
-        exact = limits.upper(_CONFIDENCE)
-        warnings.append("nothing critical was met: the probability is only bounded from above")
-    elif not found.safe or misses == 0:
-        value, missed = value if found.safe or not_hits else 1.0, drawn.lower if few_low else limits.lower
-        least = (lambda c: min(low.limit(c, side=-1), missed(c))) if found.safe else drawn.lower
-        limits = Limits(least, lambda _: 1.0)
-        warnings.append(_NONE_SAFE)
-    elif hits == 0:
-        missed = drawn.upper if few_high else limits.upper
-        limits = Limits(lambda _: 0.0, lambda c: max(high.limit(c, side=1), missed(c)))
-        warnings.append("no counted draw was critical: only an upper bound is given")
-    elif seen.known < FEW_KNOWN:
-        limits = limits.reaching(drawn.upper)
-        met = f"critical runs are known at {plural(seen.known, 'input')}"
-        warnings.append(f"{met}, fewer than {FEW_KNOWN}: {at_least(draws)}")
-    elif few_low or few_high:
-        met = f"{plural(hits, 'counted draw')} critical" if hits < FEW_HITS else f"{plural(misses, 'counted draw')} safe"
-        warnings.append(f"only {met}, fewer than {FEW_HITS}: so small a number, or {draws}, set the interval")
-    late = hits > 0 and misses > 0 and seen.late
-    if late:
-        limits = limits.reaching(drawn.upper)
-        warnings.append(denied_late(draws))
-    tail, highest = 0.5 * (1.0 + _CONFIDENCE), max(min(max(high.value, 0.0), 1.0), value)
-    if not late and (few_low or few_high or hardly_known(value, low.std_error) or hardly_known(highest, high.std_error)):
-        limits = limits.within(drawn, value, highest)
-        warnings += denied_by_draws(drawn, draws, value, highest, tail)
-    if found.critical:
-        limits = found.unviolated.reached(limits, lambda c: found.most(seen.failed, c), drawn.upper)
-        warnings += found.unviolated.sentences(draws, found.most(seen.failed, tail))
-    warnings += cautions(len(safe), low.largest_term, value, seen.surprises)
-    unseen = found.most(seen.surprises, _CONFIDENCE)
-    return _conclusion(value, limits, low.std_error, highest, hits, unseen, exact, warnings)
+    safe, worst = ([_weighted(b) for b in each] for each in (found.batches, found.worst))
+    told = told_by_batches(safe, worst, found.seen, found.unviolated, drawn_from="the campaign's distribution")
+    unseen = found.seen.most(found.seen.surprises, _CONFIDENCE)
+    return _conclusion(
+        told.value, told.limits, told.low.std_error, told.highest, told.hits, unseen, told.exact_bound, [*told.warnings]
+    )  # fmt: skip
 
 
 def _from_nominal(found: Reused) -> Concluded:
     """Return what draws from the campaign's distribution itself say."""
     batch, worst = found.batches[0], found.worst[0]
     low, high = (WeightedShare(b.coefficient, b.critical) for b in (batch, worst))
+    seen = found.seen
     hits, misses, not_hits = _weighted(batch).hits, _weighted(worst).misses, _weighted(batch).misses
-    missed = defended_bound(0, found.unmet, found.ratio, _CONFIDENCE)
+    missed = defended_bound(0, seen.nominal, seen.ratio, _CONFIDENCE)
     value, exact, warnings = min(low.value, 1.0), None, []
     limits = Limits(low.lower, high.upper)
     if not hits:
-        limits = Limits(low.lower, lambda c: defended_bound(int(worst.critical.sum()), found.nominal, found.ratio, c))
+        limits = Limits(low.lower, lambda c: defended_bound(int(worst.critical.sum()), found.nominal, seen.ratio, c))
         exact = limits.upper(_CONFIDENCE)
-        warnings.append("nothing critical was met: the probability is only bounded from above")
+        warnings.append(nothing_critical("the campaign's distribution"))
     elif not misses:
         value = value if not_hits else 1.0
-        limits = Limits(lambda c: 1.0 - defended_bound(not_hits, found.nominal, found.ratio, c), lambda _: 1.0)
-        warnings.append(_NONE_SAFE)
+        limits = Limits(lambda c: 1.0 - defended_bound(not_hits, found.nominal, seen.ratio, c), lambda _: 1.0)
+        warnings.append("no counted draw was safe: only a lower bound is given")
     return _conclusion(value, limits, low.std_error, min(high.value, 1.0), hits, missed, exact, warnings)
 
 

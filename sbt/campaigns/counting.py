@@ -25,7 +25,7 @@ from sbt.store.records import Iteration
 
 __all__ = [
     "DENIED", "DRAWN", "FEW_KNOWN", "LEARNED", "NOMINAL", "RANDOM", "Seen", "at_least", "counted_batches", "counted_iterations",
-    "crude_rows", "denied_by_draws", "denied_late", "hardly_known", "held", "random_draws", "with_event",
+    "crude_rows", "denied_by_draws", "denied_late", "hardly_known", "held", "nothing_critical", "random_draws", "with_event",
 ]  # fmt: skip
 
 DRAWN = "estimation"
@@ -228,6 +228,11 @@ def held(limits: Limits, seen: Seen, low: float, high: float, *, unstated: bool)
 def hardly_known(value: float, std_error: float) -> bool:
     """Return whether an estimate, or what it leaves to 1, is little more than its standard error."""
     return std_error > _HARDLY * min(value, 1.0 - value)
+
+
+def nothing_critical(drawn_from: str = "the inputs' distribution") -> str:
+    """Return in words that draws from a distribution alone bound a probability, as none that counts was critical."""
+    return f"no draw that counts was critical: the probability is only bounded from above, by draws from {drawn_from}"
 
 
 def at_least(draws: str) -> str:

@@ -6,21 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
+from sbt.campaigns.batches import told_by_batches
 from sbt.campaigns.clustering import Spread
-from sbt.campaigns.counting import (
-    DRAWN,
-    FEW_KNOWN,
-    NOMINAL,
-    RANDOM,
-    Seen,
-    at_least,
-    counted_batches,
-    counted_iterations,
-    denied_by_draws,
-    denied_late,
-    hardly_known,
-    held,
-)
+from sbt.campaigns.counting import DRAWN, NOMINAL, RANDOM, Seen, counted_batches, counted_iterations, nothing_critical
 from sbt.campaigns.crude import MonteCarloStage, SubsetStage, nominal_proportion, took_monte_carlo
 from sbt.campaigns.each import RequirementEstimate, each_estimate, estimates_words
 from sbt.campaigns.explained import ExplainedVariance, explained_variance
@@ -30,8 +18,7 @@ from sbt.campaigns.likeness import EarlierTold, earlier_told
 from sbt.campaigns.lost import failed_runs
 from sbt.campaigns.many_inputs import ManyInputsStage, took_subset
 from sbt.campaigns.pairing import PairStage, pairs_of, pairs_words
-from sbt.campaigns.precision import cautions
-from sbt.campaigns.repeated import NOTHING_CRITICAL, told_by_repeats
+from sbt.campaigns.repeated import told_by_repeats
 from sbt.campaigns.repeats import REPEAT, SimulatorNoise, stated_noise
 from sbt.campaigns.sequential import SequentialStage
 from sbt.campaigns.settings import CampaignKind, Settings
@@ -43,7 +30,7 @@ from sbt.campaigns.unviolated import Unviolated
 from sbt.campaigns.warmed import warmed_traffic
 from sbt.campaigns.wording import number, plural
 from sbt.errors import InputError
-from sbt.estimators.intervals import FEW_HITS, CountedBatch, combine_estimates
+from sbt.estimators.intervals import CountedBatch, combine_estimates
 from sbt.loop.stages import Campaign, Facts, Log, Stage
 from sbt.problem.combination import CombinedRequirement
 from sbt.problem.plain import Json
@@ -237,65 +224,21 @@ def _from_batches(log: Log, settings: Settings, seen: Seen | None = None) -> Con
     safe, critical = counted_batches(log, settings), counted_batches(log, settings, failed_critical=True)
     if not safe:
         return _uncounted(log, seen)
-    low, high = combine_estimates(safe), combine_estimates(critical)
-    hits, worst, misses = sum(b.hits for b in safe), sum(b.hits for b in critical), sum(b.misses for b in critical)
-    safest = sum(b.misses for b in safe)  # that of `misses` where no run failed, as each of these two
-    few_low, few_high = min(hits, safest) < FEW_HITS, min(worst, misses) < FEW_HITS
-    value, exact_bound = _clipped(low.value), None
-    limits = Limits(lambda c: low.limit(c, side=-1, few=few_low), lambda c: high.limit(c, side=1, few=few_high))
-    failing, draws = not log.history.ok.all(), f"{plural(seen.draws, 'draw')} from the inputs' distribution"
-    if hits and misses:
-        unstated = failing and any(map(is_two_level, log.iterations))
-        limits = held(limits, seen, low.value, high.value, unstated=unstated)
-    warnings = []
-    if not seen.critical:
-        limits, value = _nothing_critical(seen), 0.0
-        exact_bound = limits.upper(_CONFIDENCE)
-        warnings.append(NOTHING_CRITICAL)
-    elif not seen.safe:
-        value = 1.0 if log.history.ok.all() else value
-        limits = Limits(lambda c: 1.0 - seen.most(seen.failed, c), lambda _: 1.0)
-        bounded = "the probability is only bounded from below, by the draws from the inputs' distribution"
-        warnings.append(f"everything was critical: {bounded}")
-    elif hits == 0:
-        missed = seen.most_critical if few_high else limits.upper
-        limits = Limits(lambda _: 0.0, lambda c: max(high.limit(c, side=1), missed(c)))
-        warnings.append("no counted draw was critical: only an upper bound is given")
-    elif misses == 0:
-        missed = seen.limits.lower if few_low else limits.lower
-        limits = Limits(lambda c: min(low.limit(c, side=-1), missed(c)), lambda _: 1.0)
-        warnings.append("no counted draw was safe: only a lower bound is given")
-    elif seen.known < FEW_KNOWN:
-        limits = limits.reaching(seen.most_critical)
-        need = settings.scenario.requirement
-        whose = " of a requirement" if isinstance(need, CombinedRequirement) and need.how == "any" else ""
-        met = f"critical runs{whose} are known at {plural(seen.known, 'input')}"
-        warnings.append(f"{met}, fewer than {FEW_KNOWN}: {at_least(draws)}")
-    elif min(hits, misses) < FEW_HITS:
-        few, what = (hits, "critical") if hits < FEW_HITS else (misses, "safe")
-        met = f"{few} counted draw{' was' if few == 1 else 's were'} {what}"
-        warnings.append(f"only {met}, fewer than {FEW_HITS}: so small a number, or {draws}, set the interval")
-    late = hits > 0 and misses > 0 and seen.late
-    if late:
-        limits = limits.reaching(seen.most_critical)
-        warnings.append(denied_late(draws))
-    highest = max(_clipped(high.value), value)
-    if not late and (few_low or few_high or hardly_known(value, low.std_error) or hardly_known(highest, high.std_error)):
-        limits = limits.within(seen.limits, value, highest)
-        warnings += denied_by_draws(seen.limits, draws, value, highest, 0.5 * (1.0 + _CONFIDENCE))
-    if seen.critical:
-        others = Unviolated.of(log.history, settings)
-        limits = others.reached(limits, lambda c: seen.most(seen.failed, c), seen.most_critical)
-        warnings += others.sentences(draws, seen.most(seen.failed, 0.5 * (1.0 + _CONFIDENCE)))
-    warnings += cautions(len(safe), low.largest_term, value, seen.surprises)
+    need, ok = settings.scenario.requirement, log.history.ok.all()
+    told = told_by_batches(
+        safe, critical, seen, Unviolated.of(log.history, settings), drawn_from="the inputs' distribution",
+        known_of=" of a requirement" if isinstance(need, CombinedRequirement) and need.how == "any" else "",
+        unstated=not ok and any(map(is_two_level, log.iterations)),
+    )  # fmt: skip
+    value, limits, low = told.value, told.limits, told.low
     return _conclusion(
-        log, value, limits, failed=worst - hits, beside=_failed_beside(log, settings, seen, limits), failed_as_safe=value,
-        cov=low.std_error / low.value if value > 0 else None, effective_sample_size=low.effective_sample_size, hits=hits,
-        failed_as_critical=max(_clipped(high.value), value) if failing else value,
-        undetected_mass_bound=seen.most(seen.surprises, _CONFIDENCE), warnings=tuple(warnings),
+        log, value, limits, failed=told.worst_hits - told.hits, beside=_failed_beside(log, settings, seen, limits),
+        failed_as_safe=value, failed_as_critical=value if ok else told.highest, hits=told.hits,
+        cov=low.std_error / low.value if value > 0 else None, effective_sample_size=low.effective_sample_size,
+        undetected_mass_bound=seen.most(seen.surprises, _CONFIDENCE), warnings=told.warnings,
         largest_weight_share=low.largest_share,
         convergence=_convergence(log, safe, critical) if seen.critical and seen.safe else None,
-        counted=sum(len(b.critical) for b in safe), exact_bound=exact_bound,
+        counted=sum(len(b.critical) for b in safe), exact_bound=told.exact_bound,
     ), limits  # fmt: skip
 
 
@@ -326,14 +269,9 @@ def _uncounted(log: Log, seen: Seen) -> Concluded:
     if seen.critical:
         limits = Limits(lambda _: 0.0, lambda _: 1.0)
         return _conclusion(log, None, limits, failed=0, warnings=(few,)), limits
-    limits = _nothing_critical(seen)
-    exact, warnings = limits.upper(_CONFIDENCE), (few, NOTHING_CRITICAL)
+    limits = Limits(lambda _: 0.0, seen.most_critical)
+    exact, warnings = limits.upper(_CONFIDENCE), (few, nothing_critical())
     return _conclusion(log, None, limits, failed=seen.failed, warnings=warnings, exact_bound=exact), limits
-
-
-def _nothing_critical(seen: Seen) -> Limits:
-    """Return the exact bound while no run was critical; failed draws might have been."""
-    return Limits(lambda _: 0.0, lambda c: seen.most(seen.failed, c))
 
 
 def _from_nominal(log: Log, settings: Settings, stage: str = NOMINAL) -> Concluded:
@@ -342,7 +280,7 @@ def _from_nominal(log: Log, settings: Settings, stage: str = NOMINAL) -> Conclud
     limits = Limits(share.lower, share.upper)
     rest: Json = {}
     if share.hits == 0:
-        rest = {"exact_bound": share.upper(_CONFIDENCE), "warnings": (NOTHING_CRITICAL,)}
+        rest = {"exact_bound": share.upper(_CONFIDENCE), "warnings": (nothing_critical(),)}
     return _conclusion(
         log, share.value if share.n else None, limits, failed=share.failed, cov=share.cov,
         effective_sample_size=float(share.n), hits=share.hits,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from sbt.campaigns.counting import nothing_critical
 from sbt.campaigns.crude import FIRST_LEVEL, nominal_proportion, repeats_of
 from sbt.campaigns.gate import Limits
 from sbt.campaigns.settings import Settings
@@ -10,12 +11,7 @@ from sbt.estimators.subset import RepeatedEstimate, combine_repeats
 from sbt.loop.stages import Log
 from sbt.problem.plain import Json
 
-__all__ = ["NOTHING_CRITICAL", "are_precise", "limits_by_repeats", "told_by_repeats"]
-
-NOTHING_CRITICAL = (
-    "no draw that counts was critical: the probability is only bounded from above, by draws from the inputs' distribution"
-)
-
+__all__ = ["are_precise", "limits_by_repeats", "told_by_repeats"]
 
 def are_precise(log: Log, settings: Settings, target: float | None) -> bool:
     """Return whether all repeats have finished, with an estimate of this coefficient of variation."""
@@ -48,7 +44,7 @@ def told_by_repeats(log: Log, settings: Settings, confidence: float) -> tuple[fl
         rest |= {"cov": first.cov, "hits": first.hits, "failed_as_critical": worst, "effective_sample_size": float(first.n)}
         return first.value, Limits(first.lower, first.upper), rest | {"warnings": (said,)}
     if found.value == 0.0:
-        said = NOTHING_CRITICAL + "; subset simulation came to a level from which no run got lower"
+        said = nothing_critical() + "; subset simulation came to a level from which no run got lower"
         if cut:
             said = (
                 f"{cut} of {len(repeats)} repeats of subset simulation did not reach the critical interval in {n} runs: "
