@@ -420,18 +420,32 @@ def test_a_campaign_on_a_full_disk_goes_on_when_there_is_room(
 
 LIMITED = """
 import resource, sys
-resource.setrlimit(resource.RLIMIT_FSIZE, (120_000, 120_000))
+most = int(sys.argv.pop(1))
+resource.setrlimit(resource.RLIMIT_FSIZE, (most, most))
 import signal
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-sys.argv = ["sumo-sbt", "run", sys.argv[1], "--json"]
 from sbt.cli import main
 main()
 """
 
 
+def on_a_full_disk(most: int, *command: str) -> subprocess.CompletedProcess[str]:
+    """Call the program where no file may have more than `most` bytes."""
+    return subprocess.run([sys.executable, "-c", LIMITED, str(most), *command], capture_output=True, text=True, timeout=120)
+
+
+def test_a_disk_that_refuses_a_bundle_ends_it_with_one_line(campaign: Callable[..., dict[str, Any]], tmp_path: Path):
+    store = campaign("whole", budget=200)["store"]
+    (tmp_path / "there").mkdir()
+    done = on_a_full_disk(40_000, "bundle", store, "--to", str(tmp_path / "there" / "mail.zip"))
+    assert (done.returncode, done.stdout) == (2, "")
+    assert re.fullmatch(r"a bundle must be written into a folder that may be written, but .*mail\.zip: .*\n", done.stderr)
+    assert list((tmp_path / "there").iterdir()) == []
+
+
 def test_a_disk_that_refuses_ends_the_campaign_with_one_line(configured: Callable[..., Path], rows: Callable[..., Any]):
     config = configured("c", budget=600, initial=100, batch=100)
-    done = subprocess.run([sys.executable, "-c", LIMITED, str(config)], capture_output=True, text=True, timeout=120)
+    done = on_a_full_disk(120_000, "run", str(config), "--json")
     assert (done.returncode, done.stdout) == (1, "")
     assert re.fullmatch(r"the store must be readable and writable, but .*/c is not: .*\n", done.stderr)
     assert 0 < len(rows(config.parent / "c")["runs"]) < 600
