@@ -71,7 +71,7 @@ class BoundaryConclusion:
         critical_range: least and largest critical fraction, as runs fail or not where that is open; None: it hardly matters.
         even_fraction: critical share of all runs that fill the space evenly, the held-out ones among them; None: of recorded rows
             those that guided runs left are no random ones.
-        fails_by_chance: nothing shows that inputs decide which runs fail; None: none fails.
+        fails_by_chance: nothing says that inputs decide which runs fail; None: runs suggest that they do, or none fails.
         failing_range: ends of the failing fraction; None: it is not known to be a part of the space.
         critical_combinations: where no input is continuous; None: one is, or the metamodel sees none.
         over_traffic: P(critical) is the mean over the traffic that seeds draw; None: what inputs alone tell.

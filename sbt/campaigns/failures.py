@@ -330,7 +330,7 @@ def _statement(runs: History, hits: int, inputs: int, modes: list[FailureMode], 
         return f"No critical run in {n}. Rows that are not spread evenly over the box bound nothing.{hidden}"
     if hits == n - failed:
         return f"Every run that gave a metric was critical ({hits}): no boundary was met.{hidden}"
-    unsure = [m for m in modes if m.confirmed is not None and _uncritical(m.confirmed, m)]
+    unsure = [mode for mode in modes if _uncritical(mode)]
     unconfirmed = f" Repeats with fresh seeds did not all fail in {plural(len(unsure), 'mode')}." if unsure else ""
     counted = f"{hits} of {n} runs of the search were critical, in {plural(len(modes), 'failure mode')}"
     same = "the same inputs" if inputs == 1 else f"{inputs} different inputs"
@@ -338,9 +338,10 @@ def _statement(runs: History, hits: int, inputs: int, modes: list[FailureMode], 
     return f"{counted}.{different}{unconfirmed}{hidden}"
 
 
-def _uncritical(confirmed: float, mode: FailureMode) -> bool:
+def _uncritical(mode: FailureMode) -> bool:
     """Return whether some repetition gave a metric and was not critical."""
-    return round(confirmed * mode.confirmation_runs) + (mode.confirmations_lost or 0) < mode.confirmation_runs
+    again, gave = mode.came_back
+    return again < gave
 
 
 def _more(found: FalsificationConclusion, facts: Facts) -> list[str]:
@@ -357,7 +358,7 @@ def _more(found: FalsificationConclusion, facts: Facts) -> list[str]:
     alone = single(found.failure_modes, facts.history)
     whose = f"all {alone}" if alone == len(found.failure_modes) else f"{alone} of {len(found.failure_modes)}"
     said += [f"Modes of one input each ({whose}) may be parts of one thin or bent region."] if alone > 1 else []
-    unsure = [mode for mode in found.failure_modes[1:] if mode.confirmed is not None and _uncritical(mode.confirmed, mode)]
+    unsure = [mode for mode in found.failure_modes[1:] if _uncritical(mode)]
     said += [f"Of the other modes {len(unsure)} did not fail in every repetition with fresh seeds."] if unsure else []
     says = "says" if failed == 1 else "say"
     return [*said, *([f"{plural(failed, 'run')} of the search failed and {says} nothing about safety."] if failed else [])]

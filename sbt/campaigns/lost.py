@@ -129,12 +129,12 @@ def nearest_words(run: int, metric: str, facts: Facts) -> str:
     )
 
 
-def repetitions(again: int, n: int, lost: int, how: str = "") -> str:
-    """Return in how many of n repetitions a run was critical again, beside those that gave no metric.
+def repetitions(again: int, gave: int, lost: int, how: str = "") -> str:
+    """Return in how many of the repetitions that gave a metric a run was critical again, beside those that gave none.
 
-    >>> repetitions(2, 3, 0), repetitions(2, 3, 1)
+    >>> repetitions(2, 3, 0), repetitions(2, 2, 1)
     ('2 of 3 repetitions', '2 of the 2 repetitions that gave a metric (1 gave none)')
     """
     if not lost:
-        return f"{again} of {n} repetitions{how}"
-    return f"{again} of the {n - lost} repetitions{how} that gave a metric ({lost} gave none)"
+        return f"{again} of {gave} repetitions{how}"
+    return f"{again} of the {plural(gave, 'repetition')}{how} that gave a metric ({lost} gave none)"

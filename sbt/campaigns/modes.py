@@ -107,7 +107,8 @@ class FailureMode:
         size: critical runs in it, of the search and between its runs.
         conflict: how ego and the nearest other met; None where it is not measured.
         runs: their indices.
-        confirmed: share of the repetitions of the representative with fresh seeds that were critical; None: not repeated.
+        confirmed: share of the repetitions of the representative with fresh seeds that were critical, of those that gave a
+            metric; None: none did, or it was not repeated.
         confirmation_runs: repetitions.
         confirmations_lost: repetitions that gave no metric; None: all gave one.
         failure_rate: of the representative's inputs, where the simulator is noisy; None: it is not, or nothing was repeated.
@@ -137,6 +138,20 @@ class FailureMode:
     confirmations_lost: int | None = optional()
     choices: Mapping[str, tuple[str, ...]] | None = optional()
     digits: Mapping[str, int] | None = optional()
+
+    @property
+    def came_back(self) -> tuple[int, int]:
+        """How many of the repetitions were critical, and how many gave a metric."""
+        gave = self.confirmation_runs - (self.confirmations_lost or 0)
+        return round((self.confirmed or 0.0) * gave), gave
+
+    @property
+    def never(self) -> str:
+        """With which seed to pin it, and why, in words; empty where it came back, or was not repeated."""
+        again, gave = self.came_back
+        if again or not self.confirmation_runs:
+            return ""
+        return f", with its own seed, as no repetition {'was critical' if gave else 'gave a metric'}"
 
 
 def severity(history: History) -> Vector:
@@ -240,7 +255,7 @@ def describe(mode: Mode, history: History, scenario: LogicalScenario, again: His
         int(history.index[at]), inputs, float(y[at]), len(mode.rows),
         describe_conflict_type(-1.0 if np.isnan(conflict) else float(conflict)),
         tuple(int(history.index[k]) for k in mode.rows),
-        float(requirement.critical_runs(again).mean()) if len(again) else None, len(again),
+        float(requirement.critical_runs(again)[again.ok].mean()) if again.ok.any() else None, len(again),
         RunPoint(int(history.index[likely]), history.inputs(likely), float(y[likely])),
         None if mode.safe is None else _nearest_safe(mode.safe, inputs, history, y),
         unconfirmed=int(history.unconfirmed[list(mode.rows)].sum()),
@@ -289,8 +304,7 @@ def most_often(modes: Sequence[FailureMode]) -> FailureMode | None:
     """Return the first mode, or one whose repetitions came back clearly more often: the interval lies above the first's share."""
 
     def least(mode: FailureMode) -> float:
-        n = mode.confirmation_runs
-        return float(interval(round((mode.confirmed or 0.0) * n), n)[0])
+        return float(interval(*mode.came_back)[0])
 
     above = [mode for mode in modes[1:] if least(mode) > (modes[0].confirmed or 0.0)]
     return max(above, key=lambda mode: mode.confirmed or 0.0) if above else next(iter(modes), None)

@@ -53,8 +53,11 @@ def failing_range(learner: Learner, fitted: FittedMetamodel, runs: int) -> Ends 
 
 
 def by_chance(fitted: FittedMetamodel) -> bool | None:
-    """Return whether nothing shows that inputs decide which runs fail; None where it is not asked, or none fails."""
-    return None if not isinstance(fitted.log_success, Success) else not fitted.log_success.shown
+    """Return whether nothing says that inputs decide which runs fail; None where it is suggested, not asked, or none fails."""
+    success = fitted.log_success
+    if not isinstance(success, Success) or _LIKELY <= success.gain and not success.shown:
+        return None
+    return not success.shown
 
 
 def failing_words(share: float | None, chance: bool | None, failing: Ends | None, open_: Ends | None, facts: Facts) -> list[str]:
@@ -70,6 +73,8 @@ def failing_words(share: float | None, chance: bool | None, failing: Ends | None
     found = []
     if share is not None and chance:
         found.append(f"About {percent(share)} of all runs give no metric, and nothing shows that the inputs decide which.")
+    elif share is not None and chance is None:
+        found.append(f"About {percent(share)} of runs give no metric; they suggest, but do not show, that the inputs decide which.")
     elif share is not None:
         ends = "" if failing is None else f" ({' to '.join(map(percent, failing))})"
         found.append(f"About {percent(share)}{ends} of the parameter space gives no metric: runs there fail.")
@@ -79,6 +84,6 @@ def failing_words(share: float | None, chance: bool | None, failing: Ends | None
         if not met(facts):
             beside, between = "the metamodel expects critical runs there, though none was met", f"at most {most}"
         lead = "Where failing begins is not known sharply, and"
-        said = "Should inputs decide it after all" if chance else f"{lead} {beside}"
+        said = "Should inputs decide it" if chance is None else f"{lead} {beside}"
         found.append(f"{said}: of what gives a metric {between} may be critical.")
     return found

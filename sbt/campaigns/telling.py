@@ -31,7 +31,7 @@ from sbt.campaigns.reconciling import denial, ends, reconciled
 from sbt.campaigns.records import CONFIRM
 from sbt.campaigns.sides import all_critical, met, safe_runs
 from sbt.campaigns.whereabouts import where_critical
-from sbt.campaigns.wording import estimating, measured, number, percent, plural, requirement_words, widening
+from sbt.campaigns.wording import digits_beside, estimating, measured, number, percent, plural, requirement_words, widening
 from sbt.estimators.binomial import interval, unmet_draws
 from sbt.loop.stages import Facts
 
@@ -155,8 +155,7 @@ def tell_failures(found: FalsificationConclusion, random: CriticalShare, facts: 
     worst = f"; {_worst(modes[0], facts)}" if modes else ""
     often = most_often(modes)
     if often is not None and often is not modes[0]:
-        n, lost = often.confirmation_runs, often.confirmations_lost or 0
-        again = repetitions(round((often.confirmed or 0.0) * n), n, lost)
+        again = repetitions(*often.came_back, often.confirmations_lost or 0)
         worst += f"; run {often.representative} came back more often, in {again}"
     searched = int((facts.history.stage != CONFIRM).sum())
     many = modes_counted(len(modes), single(modes, facts.history), found.links)
@@ -179,8 +178,7 @@ def tell_failures(found: FalsificationConclusion, random: CriticalShare, facts: 
             f"; the {plural(told.counted, 'run')} {gave} drawn at random say{'s' * (told.counted == 1)}"
             f" {percent(told.critical_fraction or 0.0)} of {space} ({ends(told)}), {few}"
         )
-    never = ", with its own seed, as no repetition failed" if often is not None and often.confirmed == 0.0 else ""
-    look = "" if often is None else f"look at run {often.representative} (replay) and keep it as a test (pin{never}); "
+    look = "" if often is None else f"look at run {often.representative} (replay) and keep it as a test (pin{often.never}); "
     rest = "every combination of the inputs was run" if exhausted else "a larger budget looks for more modes"
     more = f"{look}{estimating(facts.recorded)} says how probable failures are, {rest}"
     return [said, f"{silent}.", f"Next: {more}."]
@@ -190,7 +188,7 @@ def _met(run: int, value: float | None, facts: Facts) -> str:
     """Return the metric of a run in words; a value of None is infinite, and the run says which."""
     if value is None:
         value = float(facts.requirement.told(facts.history)[facts.history.index == run][0])
-    return measured(facts.requirement.told_as, value, facts.unit)
+    return measured(facts.requirement.told_as, value, facts.unit, digits_beside(value, facts.requirement))
 
 
 def _worst(mode: FailureMode, facts: Facts) -> str:
@@ -203,13 +201,14 @@ def _worst(mode: FailureMode, facts: Facts) -> str:
         own = history.index == mode.representative
         if own.any() and np.nanmin(margins) < margins[own][0]:  # of a noisy simulator: the likeliest is not the deepest
             said = said.replace(f"{one}, ", "", 1) + f", by the search the likeliest to fail again (run {deepest} is the deepest)"
-    n = mode.confirmation_runs
-    if mode.confirmed is None or n == 0:
+    n, lost = mode.confirmation_runs, mode.confirmations_lost or 0
+    if n == 0:
         return f"{said}, was not repeated"
-    again = round(mode.confirmed * n)
-    lost = mode.confirmations_lost or 0
+    again, gave = mode.came_back
+    if not gave:
+        return f"{said}, gave no metric in any of {plural(n, 'repetition')} with fresh seeds"
     low, high = percent(float(interval(again, n)[0])), percent(float(interval(again + lost, n)[1]))
-    return f"{said}, was critical again in {repetitions(again, n, lost, ' with fresh seeds')} (95 % interval {low} to {high})"
+    return f"{said}, was critical again in {repetitions(again, gave, lost, ' with fresh seeds')} (95 % interval {low} to {high})"
 
 
 def _nothing_found(found: FalsificationConclusion, facts: Facts) -> list[str]:

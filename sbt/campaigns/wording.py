@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from sbt.problem.combination import CombinedRequirement
+from sbt.problem.combination import MARGIN, CombinedRequirement
 from sbt.problem.plain import unit_of
 from sbt.problem.requirement import Requirement
 from sbt.store.history import History
 
 __all__ = [
-    "NOTHING", "digits_of", "estimating", "failed_words", "input_value", "input_widths", "measured", "mixture_shares",
-    "narrow_digits", "number", "percent", "plural", "requirement_words", "unit_of", "widening", "written_unit",
+    "NOTHING", "digits_beside", "digits_of", "estimating", "failed_words", "input_value", "input_widths", "measured",
+    "mixture_shares", "narrow_digits", "number", "percent", "plural", "requirement_words", "unit_of", "widening", "written_unit",
 ]  # fmt: skip
 
 _NIL = 1e-30  # a rounding error of what is zero
@@ -133,6 +133,14 @@ def measured(name: str, value: Any, unit: str = "", digits: int = 3) -> str:
     ('a_co -9.74 m/s²', 'kind truck')
     """
     return f"{name} {number(value, digits)} {written_unit(unit)}".rstrip()
+
+
+def digits_beside(value: float, requirement: Requirement, digits: int = 3) -> int:
+    """Return how many significant digits tell a metric: so many, or more where it would be on the other side of the edge."""
+    critical = MARGIN if requirement.combined else requirement.critical
+    told = np.array([value, *(float(f"{value:.{n}g}") for n in range(digits, _MOST_DIGITS))])
+    same = critical.contains(told) == critical.contains(told[:1])
+    return digits + int(same[1:].argmax()) if same[1:].any() else _MOST_DIGITS
 
 
 def requirement_words(requirement: Requirement, unit: str, units: Mapping[str, str] | None = None) -> str:

@@ -96,11 +96,11 @@ def _mode(mode: Mapping[str, Any], metric: str, units: Mapping[str, str]) -> str
     violating = ", ".join(name if n == mode["size"] else f"{name} in {n}" for name, n in (mode.get("violates") or {}).items())
     said.append(f"{mode['size']} critical run{'' if mode['size'] == 1 else 's'}{violating and f', violating {violating}'}")
     if mode.get("confirmed") is not None:
-        n = mode["confirmation_runs"]
         from sbt.campaigns.lost import repetitions
 
-        again, lost = round(mode["confirmed"] * n), mode.get("confirmations_lost") or 0
-        said.append(f"critical again in {repetitions(again, n, lost)}")
+        lost = mode.get("confirmations_lost") or 0
+        gave = mode["confirmation_runs"] - lost
+        said.append(f"critical again in {repetitions(round(mode['confirmed'] * gave), gave, lost)}")
     if mode.get("unconfirmed"):
         said.append(f"{mode['unconfirmed']} with a contact that SUMO does not list")
     if mode.get("preventable"):

@@ -83,11 +83,12 @@ def _modes(result: Mapping[str, Any], width: int) -> Any:
     told = (head(result["metric"], unit_of(units, result["metric"])), *(head(name, units.get(name, "")) for name in names))
     table = _table("mode", "run", *told, "critical\nruns", "critical\nagain")
     for k, mode in enumerate(modes, start=1):
-        again, n, digits = mode.get("confirmed"), mode.get("confirmation_runs", 0), mode.get("digits") or {}
+        again, digits = mode.get("confirmed"), mode.get("digits") or {}
+        gave = mode.get("confirmation_runs", 0) - (mode.get("confirmations_lost") or 0)
         inputs = [input_value(mode["inputs"][name], digits=digits.get(name, 3)) for name in names]
         table.add_row(
             str(k), str(mode["representative"]), number(mode["metric"], 3), *inputs,
-            str(mode["size"]), "" if again is None else f"{round(again * n)} of {n - (mode.get('confirmations_lost') or 0)}",
+            str(mode["size"]), "" if again is None else f"{round(again * gave)} of {gave}",
         )  # fmt: skip
     return table
 

@@ -26,7 +26,7 @@ from sbt.problem.combination import MARGIN
 from sbt.problem.scenario import LogicalScenario
 from sbt.samplers.sobol import SobolSequence
 from sbt.seeds import stream
-from sbt.store.history import VALIDATION, History
+from sbt.store.history import History
 from sbt.store.records import FitRecord, Validation
 
 __all__ = ["FittedMetamodel", "Learner", "changed_share", "chunked"]
@@ -157,11 +157,11 @@ class Learner:
 
     def success(self, history: History) -> Success | None:
         """Return log P(a run gives a metric) at the inputs' (n, d) unit-cube points; None where all runs did, or none."""
-        space, runs = self.scenario.space, history.where(history.stage != VALIDATION)
-        if runs.ok.all():
+        space = self.scenario.space
+        if history.ok.all():
             return None
-        u = space.metamodel_inputs(space.to_unit(runs.x))
-        score = learned_success(u, runs.ok, stream(self.seed, "success", len(runs)))
+        u = space.metamodel_inputs(space.to_unit(history.x))
+        score = learned_success(u, history.ok, stream(self.seed, "success", len(history)))
         return None if score is None else score.of(space.metamodel_inputs)
 
     def on_inputs(self, predictor: Predictor, learned: int) -> Predictor:

@@ -25,6 +25,9 @@ _SPACINGS, _WIDE = 8, 8.0
 root that a speed of impact ends with there are 3 to 6."""
 _CROSSED = 1e-6
 """Of the scale on its side, what a gap that is left out measures: in it nothing is likely, but nothing impossible."""
+_BOTH = 0.75
+"""Quantile of the distances to the edge that is the scale where runs lie on both sides of M_c: as they gather at a narrow one a
+smaller scale makes a step of the warp. A quarter may be outliers."""
 _FARTHEST, _LEAST = 300.0, 1e-300
 """Warped units, beyond which values are no numbers any more; the standard deviation of what has none, as a divisor."""
 _TAILS = 4.0
@@ -222,7 +225,7 @@ class JointWarp:
     def around_edges(cls, y: Points, critical: CombinedInterval) -> JointWarp:
         """Return the warp of each metric of y (n, q) around the end of its interval."""
         columns = [y[np.isfinite(y[:, k]), k] for k in range(y.shape[1])]
-        parts = tuple(Warp.around_edge(column, leaf) for column, leaf in zip(columns, critical.leaves, strict=True))
+        parts = tuple(map(_around, columns, critical.leaves))
         leaves = [warp.interval(leaf) for warp, leaf in zip(parts, critical.leaves, strict=True)]
         return cls(parts, critical.with_leaves(leaves, (1.0,) * len(leaves)))
 
@@ -244,7 +247,13 @@ def warp_around(y: Vector, critical: CriticalInterval) -> Warp | JointWarp:
     """Return the warp for values y (n,) of one metric, or (n, q) of the metrics of a combination."""
     if isinstance(critical, CombinedInterval):
         return JointWarp.around_edges(y, critical)
-    return Warp.around_edge(y, critical)
+    return _around(y, critical)
+
+
+def _around(y: Vector, critical: CriticalInterval) -> Warp:
+    """Return the warp of one metric; where runs lie beyond both ends of M_c it is straighter: one passes from side to side."""
+    both = (y < critical.low).any() and (y > critical.high).any()
+    return Warp.around_edge(y, critical, _BOTH) if both else Warp.around_edge(y, critical)
 
 
 def gap_of(y: Vector, critical: CriticalInterval) -> tuple[float, float]:

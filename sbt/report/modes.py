@@ -40,7 +40,7 @@ def mode_table(found: Findings, space: ParameterSpace) -> Table:
     judged, widths = any(mode.preventable for mode in modes), input_widths(found.history)
     doubtful = any(mode.unconfirmed for mode in modes)
     for number_of, mode in enumerate(modes, 1):
-        confirmed = NOTHING if mode.confirmed is None else f"{percent(mode.confirmed)} of {mode.confirmation_runs}"
+        confirmed = NOTHING if mode.confirmed is None else f"{percent(mode.confirmed)} of {mode.came_back[1]}"
         confirmed += f", {mode.confirmations_lost} gave no metric" if mode.confirmations_lost else ""
         rows.append((
             Cell.of(number_of), Cell.of(mode.representative), Cell.of(mode.metric),
