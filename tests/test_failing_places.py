@@ -54,6 +54,25 @@ def test_runs_that_fail_by_chance_fail_nowhere_in_particular(tmp_path: Path):
     assert found.conclusion.critical_range is None
 
 
+def test_inputs_that_decide_which_runs_fail_are_never_told_to_be_chance(tmp_path: Path):
+    """Runs fail by P = 1.2 - 3 r; of 76 near runs 30 failed and of 24 far ones none, and nothing was said to show it."""
+
+    def run(values: dict[str, float], seed: int) -> dict[str, float]:
+        far = math.hypot(values["a"] - 0.4, values["b"] - 0.6)
+        if stream(seed, "unlucky").random() < 1.2 - 3.0 * far:
+            raise sbt.RunError("failed", "as told")
+        return {"y": far - 0.3}
+
+    inputs = [sbt.Parameter(name, 0.0, 1.0) for name in "ab"]
+    scenario = sbt.Scenario("disc", inputs, sbt.Requirement("y", high=0.0), evaluate=run)
+    found = sbt.run(
+        campaign="boundary", scenario=scenario, budget=100, seed=2, executor="serial", store=tmp_path / "s", report=False
+    )  # fmt: skip
+    told = " ".join(found.sentences())
+    assert "nothing shows" not in told
+    assert "suggest, but do not show" in told or "of the parameter space gives no metric" in told
+
+
 def test_runs_are_not_lost_where_all_fails_that_would_be_critical(tmp_path: Path):
     found = boundary(lambda v, _: math.hypot(v["a"] - 0.7, v["b"] - 0.3) < 0.2, tmp_path, 20)
     chosen = found.frame[found.frame.stage == "boundary"]
@@ -61,7 +80,8 @@ def test_runs_are_not_lost_where_all_fails_that_would_be_critical(tmp_path: Path
 
 
 def test_where_nothing_critical_was_met_no_least_share_is_told():
-    found = BoundaryConclusion(1e-90, 0.01, 0.1, None, failing_fraction=0.07, critical_range=(9.54e-89, 0.0176))
+    told_range = {"critical_range": (9.54e-89, 0.0176), "fails_by_chance": False}
+    found = BoundaryConclusion(1e-90, 0.01, 0.1, None, failing_fraction=0.07, **told_range)
     facts = [Facts(sided_runs(critical, 20), Requirement("y", high=0.0), "m", "s") for critical in (0, 3)]
     none, some = ([told for told in found.sentences(each) if "failing begins" in told] for each in facts)
     (told,) = none

@@ -55,9 +55,9 @@ def failing_range(learner: Learner, fitted: FittedMetamodel, runs: int) -> Ends 
 def by_chance(fitted: FittedMetamodel) -> bool | None:
     """Return whether nothing says that inputs decide which runs fail; None where it is suggested, not asked, or none fails."""
     success = fitted.log_success
-    if not isinstance(success, Success) or _LIKELY <= success.gain and not success.shown:
+    if not isinstance(success, Success):
         return None
-    return not success.shown
+    return False if success.shown else None if success.gain >= _LIKELY else True
 
 
 def failing_words(share: float | None, chance: bool | None, failing: Ends | None, open_: Ends | None, facts: Facts) -> list[str]:
@@ -74,7 +74,7 @@ def failing_words(share: float | None, chance: bool | None, failing: Ends | None
     if share is not None and chance:
         found.append(f"About {percent(share)} of all runs give no metric, and nothing shows that the inputs decide which.")
     elif share is not None and chance is None:
-        found.append(f"About {percent(share)} of runs give no metric; they suggest, but do not show, that the inputs decide which.")
+        found.append(f"About {percent(share)} of runs give no metric; they suggest, but do not show, that inputs decide which.")
     elif share is not None:
         ends = "" if failing is None else f" ({' to '.join(map(percent, failing))})"
         found.append(f"About {percent(share)}{ends} of the parameter space gives no metric: runs there fail.")
@@ -84,6 +84,6 @@ def failing_words(share: float | None, chance: bool | None, failing: Ends | None
         if not met(facts):
             beside, between = "the metamodel expects critical runs there, though none was met", f"at most {most}"
         lead = "Where failing begins is not known sharply, and"
-        said = "Should inputs decide it" if chance is None else f"{lead} {beside}"
+        said = f"{lead} {beside}" if chance is False else "Should inputs decide it after all"
         found.append(f"{said}: of what gives a metric {between} may be critical.")
     return found
