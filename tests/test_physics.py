@@ -9,12 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from own_networks import run_program
 from scenario_points import sobol
 
 import sbt
 from sbt.execution.spec import ScenarioSpec
 from sbt.execution.worker import run_job
-from sbt.metrics.physics import breaches, stopped_dead
+from sbt.metrics.physics import breaches, drove_on, stopped_dead
 from sbt.plugins import load, names
 from sbt.problem.outcome import Doubt, Job, doubts
 from sbt.problem.parameter import Parameter
@@ -268,3 +269,49 @@ def test_who_is_stopped_dead_near_the_ego_is_told_in_the_row() -> None:
     outcome = run_job(scenario, Job(0, {"a": 0.5}, 1))
     assert outcome.unconfirmed == "stopped dead: 'co' at 1.000 s, by 100 m/s^2"
     assert doubts(outcome.unconfirmed) == (Doubt.STOPPED,)
+
+
+def test_others_who_drive_into_each_other_and_on_are_told() -> None:
+    """SUMO lists them and lets both drive on; nothing was said where the run's own failure came half a minute later."""
+    t = 0.1 * np.arange(40.0)
+    x = np.stack([0.0 * t, 60.0 - 10.0 * t, 20.0 + 10.0 * t], axis=1)  # two meet at 40 m, after 2 s
+    speed = np.broadcast_to([0.0, 10.0, 10.0], x.shape)
+    size = np.full(3, 5.0), np.full(3, 1.8)
+    trace = Trace(t, ("ego", "a", "b"), x, 0.0 * x, 0.0 * x, speed, 0.0 * x, *size)
+
+    def told(*listed: str) -> list[tuple[str, str, float]]:
+        return drove_on(dataclasses.replace(trace, reported=listed), "ego")
+
+    assert told("b>a@2.000", "a>b@2.100") == [("a", "b", 2.0)]
+    assert told("a>b@0.500") == [], "bodies are apart: listed for a gap, or by shapes"
+    assert told("ego>a@2.000", "a>gone@2.000") == []
+    assert drove_on(dataclasses.replace(trace.select(slice(21)), reported=("a>b@2.000",)), "ego") == [], "the run ends there"
+
+
+@pytest.mark.sumo
+def test_a_crash_of_others_in_sumo_is_told(tmp_path: Path) -> None:
+    grid = ("--grid", "--grid.x-number", "2", "--grid.y-number", "1", "--grid.length", "600")
+    run_program(tmp_path, "netgenerate", *grid, "-o", "net.net.xml")
+    (tmp_path / "my.rou.xml").write_text("""<routes><vType id="blind" decel="0.1" emergencyDecel="0.1" tau="0.1" minGap="0"/>
+<route id="r" edges="A0B0"/><route id="back" edges="B0A0"/>
+<vehicle id="ego" route="back" depart="0" departPos="390" departSpeed="${v}"/>
+<vehicle id="a" route="r" depart="0" departPos="190" departSpeed="0"><stop lane="A0B0_0" endPos="191" duration="60"/></vehicle>
+<vehicle id="b" type="blind" route="r" depart="0" departPos="150" departSpeed="20" insertionChecks="none"/>
+</routes>""")
+    (tmp_path / "my.sumocfg").write_text(
+        '<configuration><net-file value="net.net.xml"/><route-files value="my.rou.xml"/>'
+        '<step-length value="0.1"/></configuration>'
+    )
+    (tmp_path / "scenario.yaml").write_text("""sumo: my.sumocfg
+inputs: {v: {min: 5, max: 10, unit: m/s}}
+ego: {id: ego}
+duration: 8
+metrics: [distance_min]
+requirement: {metric: distance_min, critical: [-.inf, 0]}
+""")
+    scenario = ScenarioSpec(str(tmp_path / "scenario.yaml")).resolve()
+    outcome = run_job(scenario, Job(0, {"v": 8.0}, 1))
+    assert (outcome.status, doubts(outcome.unconfirmed)) == ("ok", (Doubt.DROVE_ON,)), outcome
+    assert outcome.unconfirmed.startswith("drove on after a collision: 'a' and 'b' at ")
+    result = sbt.run(campaign="coverage", scenario=scenario, budget=3, store=tmp_path / "s", executor="serial", report=False)
+    assert any(said.startswith("In 3 of 3 runs two other road users near the ego collide") for said in result.sentences())

@@ -16,8 +16,8 @@ import numpy as np
 
 from sbt import interruption
 from sbt.errors import InputError, PluginError, RunError, SbtError, described
-from sbt.metrics.physics import beyond_tyres, stopped_dead
-from sbt.problem.outcome import IMPOSSIBLE, STOPPED, Job, Outcome, Status
+from sbt.metrics.physics import beyond_tyres, drove_on, stopped_dead
+from sbt.problem.outcome import DROVE_ON, IMPOSSIBLE, STOPPED, Job, Outcome, Status
 from sbt.problem.scenario import Batched, LogicalScenario
 from sbt.problem.trace import Trace
 
@@ -175,6 +175,7 @@ def _measured(scenario: LogicalScenario, trace: Trace | BaseException) -> _Measu
     ego = scenario.roles.ego
     doubts = [*trace.unconfirmed, *(f"{IMPOSSIBLE}{a:.3g} m/s^2 of {ego} at {t:.3f} s" for a, t in beyond_tyres(trace, ego))]
     doubts += [f"{STOPPED}'{name}' at {t:.3f} s, by {a:.3g} m/s^2" for name, a, t in stopped_dead(trace, ego)]
+    doubts += [f"{DROVE_ON}'{a}' and '{b}' at {t:.3f} s" for a, b, t in drove_on(trace, ego)]
     return scenario.measure(trace), " ".join(trace.reported), " | ".join(doubts)
 
 

@@ -130,6 +130,30 @@ class Facts:
         )  # fmt: skip
 
 
+_MOVED = {
+    Doubt.IMPOSSIBLE: (
+        "the ego moves as no vehicle can", ": what its controller commands is done, however much (column unconfirmed)"
+    ),
+    Doubt.TELEPORTED: (
+        "a road user near the ego was teleported",
+        ": metrics see it leave and come, not move (column unconfirmed; SUMO's time-to-teleport)",
+    ),
+    Doubt.CROSSED: (
+        "a road user near the ego was moved over a junction within a step",
+        ": metrics see it leave and come (column unconfirmed; the network has no lanes inside junctions)",
+    ),
+    Doubt.STOPPED: (
+        "another road user brakes as no vehicle can",
+        " (column unconfirmed); SUMO lets one do so before a red light or where its lane ends",
+    ),
+    Doubt.DROVE_ON: (
+        "two other road users near the ego collide and drive on",
+        ": SUMO stops nobody, and what comes of it is not what happens on a road (column unconfirmed)",
+    ),
+}  # fmt: skip
+"""What happens in runs that are doubtful by how somebody moves, and why."""
+
+
 def sentences_of(conclusion: Conclusion, facts: Facts) -> list[str]:
     """Return the sentences of a conclusion, and what a metric of the requirement is that has no unit, where that is known."""
     said = conclusion.sentences(facts)
@@ -141,25 +165,23 @@ def sentences_of(conclusion: Conclusion, facts: Facts) -> list[str]:
             which = f"{such} are critical by what they gave; they count"
         rule = "as failed, not as critical: give the metric that was no number a value for where there is none"
         said = [*said[:3], f"{which} {rule}.", *said[3:]]
-    odd = int(facts.history.doubtful(Doubt.IMPOSSIBLE).sum())
-    if said and odd:
-        which = f"In {odd:,} of {len(facts.history):,} runs the ego moves as no vehicle can"
-        said = [*said, f"{which}: what its controller commands is done, however much (column unconfirmed)."]
-    moved = int(facts.history.doubtful(Doubt.TELEPORTED).sum())
-    if said and moved:
-        which = f"In {moved:,} of {len(facts.history):,} runs a road user near the ego was teleported"
-        said = [*said, f"{which}: metrics see it leave and come, not move (column unconfirmed; SUMO's time-to-teleport)."]
-    crossed = int(facts.history.doubtful(Doubt.CROSSED).sum())
-    if said and crossed:
-        which = f"In {crossed:,} of {len(facts.history):,} runs a road user near the ego was moved over a junction within a step"
-        said = [*said, f"{which}: metrics see it leave and come (column unconfirmed; the network has no lanes inside junctions)."]
-    dead = int(facts.history.doubtful(Doubt.STOPPED).sum())
-    if said and dead:
-        which = f"In {dead:,} of {len(facts.history):,} runs another road user brakes as no vehicle can"
-        said = [*said, f"{which} (column unconfirmed); SUMO lets one do so before a red light or where its lane ends."]
+    if said:
+        said = [*said, *_doubted(facts)]
     bare = [part.metric for part in facts.requirement.parts if not unit_of(facts.units, part.metric)]
     meant = [f"{metric}: {facts.meanings[metric]}." for metric in bare if metric in facts.meanings]
     return said and [*said, *meant, *facts.notes]
+
+
+def _doubted(facts: Facts) -> list[str]:
+    """Return how many runs, and critical ones, are doubtful by how somebody moves."""
+    found, critical = [], facts.requirement.critical_runs(facts.history)
+    for doubt, (happens, why) in _MOVED.items():
+        doubted = facts.history.doubtful(doubt)
+        if doubted.any():
+            n = int((doubted & critical).sum())
+            also = f" {n:,} of them {'is' if n == 1 else 'are'} critical." if n else ""
+            found.append(f"In {int(doubted.sum()):,} of {len(facts.history):,} runs {happens}{why}.{also}")
+    return found
 
 
 def _violating(facts: Facts) -> list[int]:

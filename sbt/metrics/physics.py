@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sbt.metrics.geometry import rectangle_distance
+from sbt.metrics.geometry import part_pairs, rectangle_distance, select_instants
 from sbt.problem.arrays import Mask
 from sbt.problem.trace import ActorTrace, Trace
 
-__all__ = ["LAWS", "Breach", "Law", "beyond_tyres", "breaches", "persons", "worst"]
+__all__ = ["LAWS", "Breach", "Law", "beyond_tyres", "breaches", "drove_on", "persons", "stopped_dead", "worst"]
 
 LATERAL_WINDOW, JERK_WINDOW = 0.5, 0.2
 """Times over which lateral accelerations and jerks are averaged (s)."""
@@ -30,6 +30,7 @@ START = 0.1
 """Collisions that SUMO reports up to this time belong to the start (s)."""
 _TYRES = 15.0
 """Acceleration that no tyre holds (m/s^2): half again what dry asphalt lets it."""
+_SAME = 1e-3  # by which times with three digits may be off (s)
 _PERSON = 1.0
 _AHEAD, _BESIDE = 60.0, 7.0
 
@@ -146,6 +147,23 @@ def stopped_dead(trace: Trace, ego: str) -> list[tuple[str, float, float]]:
         return []
     at, k = np.unravel_index(braking.argmax(), braking.shape)
     return [(trace.actors[k], float(braking[at, k]), float(trace.time[at + 1]))]
+
+
+def drove_on(trace: Trace, ego: str) -> list[tuple[str, str, float]]:
+    """Return which two others drove into each other, and when (s), before the run ended; each pair once.
+
+    Those that SUMO lists and whose bodies overlap: it lets both drive on.
+    """
+    found: dict[tuple[str, str], float] = {}
+    for text in trace.reported:
+        listed, _, at = text.rpartition("@")
+        pair = tuple(sorted(listed.split(">")))
+        k = int(np.searchsorted(trace.time, float(at) - _SAME))
+        if len(pair) == 2 and ego not in pair and set(pair) <= set(trace.actors) and k < len(trace.time) - 1:
+            a, b = (select_instants(trace.actor(name), slice(max(k - 1, 0), k + 2)) for name in pair)
+            if any((rectangle_distance(one, other) <= 0.0).any() for one, other in part_pairs(a, b)):
+                found.setdefault((pair[0], pair[1]), float(at))
+    return [(*pair, t) for pair, t in found.items()]
 
 
 def longitudinal(trace: Trace) -> Table:

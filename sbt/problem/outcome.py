@@ -10,8 +10,8 @@ from enum import StrEnum
 from sbt.problem.plain import Values
 
 __all__ = [
-    "CROSSED", "IMPOSSIBLE", "LISTED_ONLY", "OTHER_LEVEL", "STOPPED", "STRUCK", "TELEPORTED", "UNCONFIRMED", "Doubt", "Job",
-    "Outcome", "Status", "doubts", "given", "reason_alone", "with_given",
+    "CROSSED", "DROVE_ON", "IMPOSSIBLE", "LISTED_ONLY", "OTHER_LEVEL", "STOPPED", "STRUCK", "TELEPORTED", "UNCONFIRMED", "Doubt",
+    "Job", "Outcome", "Status", "doubts", "given", "reason_alone", "with_given",
 ]  # fmt: skip
 
 UNCONFIRMED, LISTED_ONLY = "contact with ", "listed with "
@@ -22,6 +22,8 @@ IMPOSSIBLE, STOPPED = "as no vehicle can: ", "stopped dead: "
 """How the text begins of a motion of the ego, and of another, that no tyre holds: commanded, or done by SUMO."""
 TELEPORTED, CROSSED = "teleported: ", "moved over a junction: "
 """How the text begins of a road user near the ego that was moved to another place, and of one over a junction without lanes."""
+DROVE_ON = "drove on after a collision: "
+"""How the text begins of two others near the ego that drove into each other, and on."""
 
 _GAVE = "; the run gave "
 """What stands in a reason before the metrics that a failed run gave beside the one that it did not."""
@@ -70,11 +72,14 @@ class Doubt(StrEnum):
     """within a step, as the network has no lanes inside junctions"""
     STOPPED = "another road user was stopped dead"
     """a road user brakes by more than tyres hold, such as SUMO lets one before a red light or where its lane ends"""
+    DROVE_ON = "others near the ego collided and drove on"
+    """two other road users drove into each other, and on: SUMO stops nobody"""
 
 
 _BEGINNINGS = {
     UNCONFIRMED: Doubt.UNCONFIRMED, LISTED_ONLY: Doubt.LISTED_ONLY, STRUCK: Doubt.STRUCK, OTHER_LEVEL: Doubt.OTHER_LEVEL,
     IMPOSSIBLE: Doubt.IMPOSSIBLE, TELEPORTED: Doubt.TELEPORTED, CROSSED: Doubt.CROSSED, STOPPED: Doubt.STOPPED,
+    DROVE_ON: Doubt.DROVE_ON,
 }  # fmt: skip
 
 
