@@ -213,6 +213,9 @@ def test_the_command(estimated, tmp_path):
     given.write_text("x1: {distribution: {kind: normal, mean: 0.7}}\n")
     result = CliRunner().invoke(app, ["estimate-again", store, "--inputs", str(given)])
     assert (result.exit_code, f"{given}:1:20: inputs.x1.distribution" in result.stderr) == (2, True)
+    given.write_text("input: {x1: {distribution: {kind: normal, mean: 0.7, std: 1}}}\n")
+    result = CliRunner().invoke(app, ["estimate-again", store, "--inputs", str(given)])
+    assert (result.exit_code, f"{given}:1:1: input: unknown key (did you mean 'inputs'?)" in result.stderr) == (2, True)
     assert hashlib.sha256(database.read_bytes()).hexdigest() == before
 
 

@@ -369,6 +369,7 @@ def test_without_changes_the_scenario_is_the_plugins_own(folder: Path):
         ("metamodel: {kind: et, preset: papr}", "f.yaml:3:12: metamodel: ExtraTrees takes a preset of paper, but got 'papr'"),
         ("metamodel: {kind: 'plugin.py:my_acquisition'}", "metamodel.kind: a metamodel must be a class (or an object) with fit(u, y, rng)"),
         ("acquisition: {kind: bondary}", "f.yaml:3:21: acquisition.kind: acquisitions must be one of"),
+        ("acquisition: {kind: mixx}", "or file.py:NAME, but got 'mixx' (did you mean 'mix'?)"),
         ("acquisition: {kind: 'plugin.py:NOT_A_SCENARIO'}", "acquisition.kind: an acquisition must be a function"),
     ],
 )  # fmt: skip

@@ -158,3 +158,25 @@ def test_a_combination_learns_each_metric_from_the_earlier_runs_that_have_it():
     earlier = EarlierRuns.from_json(EarlierRuns(v, y, other=True).to_json())
     assert np.array_equal(earlier.y, y, equal_nan=True)
     assert earlier.helps(earlier.own(u), np.column_stack([later(u), later(u)]), both, rng)
+
+
+@pytest.mark.parametrize("campaign", ["boundary", "estimation", "falsification"])
+def test_an_earlier_campaign_in_other_units_is_refused(campaign: str, tmp_path: Path):
+    """Speeds in km/h were taken for m/s, and distances in m for cm."""
+
+    def driving(speed: str, gap: str, folder: str, **keys: Any) -> sbt.Result:
+        asked = sbt.Scenario(
+            folder, [sbt.Parameter("v", 0.0, 1.0, speed)], sbt.Requirement("gap", high=0.5), metrics={"gap": gap},
+            evaluate=lambda values, seed: {"gap": values["v"]},
+        )  # fmt: skip
+        return sbt.run(
+            campaign=campaign, scenario=asked, budget=10, seed=0, store=tmp_path / folder, executor="serial", report=False, **keys
+        )
+
+    driving("km/h", "m", "old")
+    warm = {"store": str(tmp_path / "old"), "transfer": True}
+    driving("km/h", "m", "same", warm_start=warm)
+    with pytest.raises(sbt.InputError, match=r"must have the same units, but .*old has v in km/h there, in m/s here$"):
+        driving("m/s", "m", "other", warm_start=warm)
+    with pytest.raises(sbt.InputError, match=r"must have the same units, but .*old has gap in m there, in cm here$"):
+        driving("km/h", "cm", "another", warm_start=warm)

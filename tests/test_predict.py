@@ -162,6 +162,10 @@ def test_a_campaign_without_metamodel_says_so(campaign, tmp_path):
     done = invoke("predict", tmp_path / "s", "--inputs", tmp_path / "rows.csv")
     assert done.exit_code == 2
     assert "predict needs a campaign with a metamodel" in done.stderr
+    keys = {"budget": 20, "metamodel": {"kind": "gp"}, "acquisition": {"kind": "monte_carlo"}}
+    campaign(campaign="estimation", store=str(tmp_path / "mc"), **keys)
+    done = invoke("predict", tmp_path / "mc", "--inputs", tmp_path / "rows.csv")
+    assert "acquisition monte_carlo learns none" in done.stderr
 
 
 def test_no_cell_of_the_written_table_is_a_formula(tmp_path):

@@ -11,6 +11,13 @@ from sbt.store.records import Validation
 scenario = sbt.Scenario(
     "line", [sbt.Parameter("a", 0, 1, "m")], sbt.Requirement("y", high=0.5), evaluate=lambda values, seed: {"y": values["a"]}
 )
+
+
+def drive(values: dict[str, float], seed: int) -> dict[str, float]:
+    return {"y": values["a"]}
+
+
+sbt.Scenario("line", [sbt.Parameter("a", 0, 1, "m")], sbt.Requirement("y", high=0.5), evaluate=drive)
 result = sbt.run(campaign="boundary", scenario=scenario, metamodel="gp", budget=20)
 assert_type(result, sbt.Result[BoundaryConclusion])
 assert_type(result.conclusion, BoundaryConclusion)

@@ -14,6 +14,7 @@ from sbt.config.model import Condition, CorrelationEntry, InputChange
 from sbt.config.requirement_model import MOST
 from sbt.config.source import Problems, SourceMap, must_be_one_of, read_yaml
 from sbt.config.space import SpaceChanges, configured_space
+from sbt.errors import did_you_mean
 from sbt.problem.plain import JsonMapping
 from sbt.problem.space import ParameterSpace
 
@@ -46,7 +47,8 @@ def asked_space(inputs: Path | JsonMapping, space: ParameterSpace) -> ParameterS
     data, source, wrong = read_yaml(read_text(inputs), str(inputs))
     if not isinstance(data, dict):
         raise ConfigError([f"{inputs}:1:1: must be a mapping such as inputs: {{speed: {{distribution: ...}}}}"])
-    if not set(data) & set(Asked.model_fields):
+    fields, known = Asked.model_fields, any(name in data for name in space.names)
+    if not set(data) & set(fields) and (known or not any(did_you_mean(str(key), fields) for key in data)):
         data = {"inputs": data}
         source = replace(source, places={("inputs", *key): place for key, place in source.places.items()})
     return _space(data, source, wrong, space, inputs.resolve().parent)

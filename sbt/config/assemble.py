@@ -17,14 +17,14 @@ from sbt.config.fidelity import check_levels, coarse_level
 from sbt.config.load import Loaded
 from sbt.config.model import Choice
 from sbt.config.several import combined_requirement
-from sbt.config.source import Problems, must_be_measured
+from sbt.config.source import Problems, must_be_measured, must_be_one_of
 from sbt.config.space import configured_space
 from sbt.errors import InputError
 from sbt.execution.carrying import carry, keep_here
 from sbt.execution.spec import ScenarioSpec
 from sbt.metamodels.base import Metamodel, build, call
 from sbt.metamodels.recalibrated import Recalibrated
-from sbt.plugins import OBJECT
+from sbt.plugins import OBJECT, names
 from sbt.problem.metric import metric_from
 from sbt.problem.plain import Json
 from sbt.problem.requirement import Requirement
@@ -216,9 +216,13 @@ def _metamodel(loaded: Loaded, problems: Problems) -> Metamodel | None:
 
 
 def _acquisition(loaded: Loaded, problems: Problems) -> Acquisition | None:
-    kind = loaded.config.acquisition.kind
+    kind, installed = loaded.config.acquisition.kind, names("acquisitions")
     if kind in loaded.kind.methods:
         return None
+    if kind.isidentifier() and kind not in installed and ("acquisitions", kind) not in loaded.scope.objects:
+        known = must_be_one_of("acquisitions", kind, [*loaded.kind.methods, *installed])
+        problems.add(("acquisition", "kind"), known.replace(", but got", ", or file.py:NAME, but got", 1))
+        return even
     found = problems.attempt(("acquisition", "kind"), lambda: loaded.scope.load("acquisitions", kind))
     if found is not None and not callable(found):
         problems.add(("acquisition", "kind"), f"an acquisition must be a function, but '{kind}' is not")

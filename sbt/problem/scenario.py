@@ -21,8 +21,8 @@ from sbt.problem.trace import Trace
 
 __all__ = ["Batched", "Configurable", "Evaluate", "LogicalScenario", "Metric", "Pool", "Roles", "Simulate", "metric_from"]
 
-Evaluate = Callable[[Values, int], Mapping[str, float]]
-"""(values, seed) -> metrics by name; inputs with choices have text as value."""
+Evaluate = Callable[[Any, int], Mapping[str, float]]
+"""(values, seed) -> metrics by name; values are a mapping of inputs by name, text where they are choices."""
 
 
 class Simulate(Protocol):

@@ -12,6 +12,7 @@ from sbt.estimators.transfer import Transfer
 from sbt.loop.earlier import EarlierRuns
 from sbt.loop.learner import Learner
 from sbt.metamodels.base import simplest
+from sbt.problem.plain import unit_of
 from sbt.problem.scenario import LogicalScenario
 from sbt.store.history import History
 
@@ -46,9 +47,10 @@ class EarlierCampaign:
             config: of the new campaign.
 
         Raises:
-            InputError: see `same_runs` and `earlier_runs`.
+            InputError: see `same_runs` and `earlier_runs`; or it has an input or a required metric in another unit.
         """
         choice, scenario = self.choice, learner.scenario
+        self._check_units(scenario)
         runs = self.history if choice.transfer else self.same_runs(scenario)
         learn = simplest(learner.metamodel)
         return earlier_runs(
@@ -59,17 +61,28 @@ class EarlierCampaign:
         """Return what it tells as a trend; arguments as of `pooled`.
 
         Raises:
-            InputError: see `transfer_of`.
+            InputError: see `transfer_of`; or it has an input or a required metric in another unit.
         """
+        self._check_units(learner.scenario)
         learn, fixed = learner.metamodel, self.choice.fixed
         return transfer_of(self.scenario, self.history.training, learner.scenario, learn, config.seed, fixed)
+
+    def _check_units(self, scenario: LogicalScenario) -> None:
+        """Refuse runs with an input or a required metric in another unit: numbers would be compared that mean other things."""
+        old, new, metrics = self.scenario.units, scenario.units, [part.metric for part in scenario.requirement.parts]
+        units = {name: (old.get(name, ""), new.get(name, "")) for name in scenario.space.names}
+        units |= {name: (unit_of(old, name), unit_of(new, name)) for name in metrics if name not in units}
+        others = [f"{name} in {a} there, in {b} here" for name, (a, b) in units.items() if a and b and a != b]
+        if others:
+            raise InputError(f"warm_start.store must have the same units, but {self.folder} has {'; '.join(others)}")
 
     def same_runs(self, scenario: LogicalScenario) -> History:
         """Return its runs that are feasible in the scenario as it is now, their choices coded as there.
 
         Raises:
-            InputError: it had other inputs, or did not measure what is required now.
+            InputError: it had other inputs, or other units of them, or did not measure what is required now.
         """
+        self._check_units(scenario)
         space, history = scenario.space, self.history
         if history.names != space.names:
             raise InputError(

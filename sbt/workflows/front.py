@@ -295,7 +295,8 @@ def installed(kind: str = "scenarios") -> dict[str, str]:
 
 
 def _line_on(thing: Any) -> str:
-    """Return the first line of a description or docstring."""
-    text = getattr(thing, "description", "") or inspect.getdoc(thing) or ""
+    """Return the first line of a description or docstring; of a scenario without one its inputs."""
+    own = f"inputs: {', '.join(thing.space.names)}" if isinstance(thing, LogicalScenario) else inspect.getdoc(thing)
+    text = getattr(thing, "description", "") or own or ""
     unit = f" ({thing.unit})" if getattr(thing, "unit", "") else ""
     return (text.strip().splitlines() or [""])[0] + unit

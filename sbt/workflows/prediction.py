@@ -121,7 +121,7 @@ def predict_inputs(
         study, history = Study.from_store(store, objects=objects), store.history()
     learner, choice = study.learner, study.config.metamodel
     if learner is None or choice is None:
-        raise InputError(f"predict needs a campaign with a metamodel, but {folder} has none (add metamodel: {{kind: auto}})")
+        raise InputError(f"predict needs a campaign with a metamodel, but of {folder} {study.unlearned}")
     space, requirement = study.scenario.space, study.scenario.requirement.in_units_of(history)
     x, ignored = read(space)
     learner, training = learner.telling(history), history.finished
