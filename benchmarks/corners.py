@@ -8,6 +8,7 @@
     python benchmarks/corners.py waves [--seeds 12]
     python benchmarks/corners.py sometimes [--seeds 60]
     python benchmarks/corners.py idle [--seeds 12]
+    python benchmarks/corners.py bands [--seeds 12]
 
 `ties` repeats one subset simulation of 200 points a level on a plane in two and ten normal inputs whose margin is rounded or
 cut off. `many` is what campaigns with many inputs do where no few directions explain the metric, without the store: the
@@ -15,7 +16,8 @@ choice between crude Monte Carlo and subset simulation, and both. `repeats` are 
 `batches` runs campaigns on P(x >= 2) of a normal x beside a second input that moves the edge, or makes the metric jump.
 `chance` has a smooth region of P = .001, and a sixth of the space where one seed in ten fails, which no metric shows, with a
 gate of .012; `waves` a deterministic metric with seven periods along an input. `sometimes` are falsifications of 100 runs
-where the conflict arises with some seeds only; `idle` such of wells beside choices that change nothing.
+where the conflict arises with some seeds only; `idle` such of wells beside choices that change nothing; `bands` such of 80 runs
+where a narrow range within a smooth metric's is critical.
 """
 
 from __future__ import annotations
@@ -263,10 +265,10 @@ SOMETIMES: dict[str, tuple[float, float, Callable[[dict], float], Callable[[dict
 """Share of the seeds with the conflict, edge, metric with it and without it."""
 
 
-def _falsified(scenario: sbt.Scenario, seed: int) -> object:
+def _falsified(scenario: sbt.Scenario, seed: int, budget: int = 100) -> object:
     with tempfile.TemporaryDirectory() as folder:
         result = sbt.run(
-            campaign="falsification", scenario=scenario, seed=seed, budget=100, executor="serial", report=False,
+            campaign="falsification", scenario=scenario, seed=seed, budget=budget, executor="serial", report=False,
             store=f"{folder}/s",
         )  # fmt: skip
         return result.frame, result.conclusion
@@ -309,9 +311,30 @@ def idle(seeds: int) -> None:
         print(f"| {choices or 'none'} | 2 | {told} | {met} |", flush=True)
 
 
+BANDS: dict[str, tuple[float, float, Callable[[dict], np.ndarray]]] = {
+    "sin 5a + b^2 + .3c": (0.5, 0.506, lambda v: np.sin(5 * v["a"]) + v["b"] ** 2 + 0.3 * v["c"]),
+    "6a cos 3b + 2c + a^2": (3.0, 3.04, lambda v: 6 * v["a"] * np.cos(3 * v["b"]) + 2 * v["c"] + v["a"] ** 2),
+}
+"""Ends of the critical interval, metric."""
+
+
+def bands(seeds: int) -> None:
+    print("| metric | critical share | runs to the first, by seed | critical runs of 80 (mean) | random |\n|---|---|---|---|---|")
+    inputs = [sbt.Parameter(name, 0.0, 1.0) for name in "abc"]
+    for name, (low, high, metric) in BANDS.items():
+        need = sbt.Requirement("m", low=low, high=high)
+        scenario = sbt.Scenario("band", inputs, need, evaluate=lambda v, seed, metric=metric: {"m": float(metric(v))})
+        y = metric(dict(zip("abc", np.random.default_rng(0).random((3, 1_000_000)), strict=True)))
+        p = float(((y >= low) & (y <= high)).mean())
+        found = [_falsified(scenario, 100 + seed, 80)[1] for seed in range(seeds)]
+        first = ", ".join("none" if each.runs_to_first is None else str(each.runs_to_first) for each in found)
+        hits = np.mean([each.critical_runs for each in found])
+        print(f"| {name} | {p:.4f} | {first} | {hits:.1f} | {80 * p:.1f} |", flush=True)
+
+
 CORNERS = {
     "many": many, "ties": ties, "repeats": repeats, "batches": batches, "chance": chance, "waves": waves, "sometimes": sometimes,
-    "idle": idle,
+    "idle": idle, "bands": bands,
 }  # fmt: skip
 
 
