@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from sbt.config.assemble import acquisition_of, assemble, metamodel_of, scenario_of, spec_of
+from sbt.config.assemble import assemble, metamodel_of, scenario_of, spec_of
 from sbt.config.executor_model import EXECUTORS
 from sbt.config.kinds import kinds
 from sbt.config.load import ConfigError, dump, fingerprint, load, parse, resolve, resumed, schema
@@ -322,7 +322,7 @@ def test_a_full_configuration_is_assembled(folder: Path):
     assert made.acquisition.__name__ == "my_acquisition"
     assert pickle.loads(pickle.dumps(made.spec)).resolve().name == "plane"
     assert scenario_of(loaded).requirement == made.scenario.requirement
-    assert (metamodel_of(loaded), acquisition_of(loaded)) == (made.metamodel, made.acquisition)
+    assert metamodel_of(loaded) == made.metamodel
 
 
 def test_preset_and_settings_of_a_metamodel(folder: Path):

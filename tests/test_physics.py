@@ -284,7 +284,7 @@ def test_others_who_drive_into_each_other_and_on_are_told() -> None:
 
     assert told("b>a@2.000", "a>b@2.100") == [("a", "b", 2.0)]
     assert told("a>b@0.500") == [], "bodies are apart: listed for a gap, or by shapes"
-    assert told("ego>a@2.000", "a>gone@2.000") == []
+    assert told("ego>a@2.000", "a>gone@2.000", "a hit b", "a>b@", "@") == [], "not of the ego, nor what others write"
     assert drove_on(dataclasses.replace(trace.select(slice(21)), reported=("a>b@2.000",)), "ego") == [], "the run ends there"
 
 

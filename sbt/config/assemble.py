@@ -30,7 +30,7 @@ from sbt.problem.plain import Json
 from sbt.problem.requirement import Requirement
 from sbt.problem.scenario import LogicalScenario
 
-__all__ = ["Assembly", "acquisition_of", "assemble", "check", "metamodel_of", "scenario_of", "spec_of"]
+__all__ = ["Assembly", "assemble", "check", "metamodel_of", "scenario_of", "spec_of"]
 
 T = TypeVar("T")
 
@@ -103,15 +103,6 @@ def metamodel_of(loaded: Loaded) -> Metamodel | None:
         ConfigError: unknown metamodel, preset or setting, or a value it refuses.
     """
     return _without_problems(loaded, _metamodel)
-
-
-def acquisition_of(loaded: Loaded) -> Acquisition | None:
-    """Return the acquisition function, None where the campaign has its own way to choose.
-
-    Raises:
-        ConfigError: there is no such acquisition.
-    """
-    return _without_problems(loaded, _acquisition)
 
 
 def _without_problems(loaded: Loaded, make: Callable[[Loaded, Problems], T]) -> T:

@@ -75,6 +75,8 @@ def _side(critical: CriticalInterval) -> int:
 
 
 def _ranks(values: Vector) -> Vector:
-    """Return ranks: one residual far out does not decide a correlation."""
-    return np.argsort(np.argsort(values, kind="stable"), kind="stable").astype(np.float64)
+    """Return ranks, of equal values their mean: one residual far out does not decide a correlation."""
+    from scipy.stats import rankdata
+
+    return np.asarray(rankdata(values), dtype=np.float64)
 

@@ -8,6 +8,7 @@ the lanes of a road network are polygonal lines that SUMO's vehicles follow exac
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -31,6 +32,8 @@ START = 0.1
 _TYRES = 15.0
 """Acceleration that no tyre holds (m/s^2): half again what dry asphalt lets it."""
 _SAME = 1e-3  # by which times with three digits may be off (s)
+_LISTED = re.compile(r"([^>]+)>([^>]+)@(\d+(?:\.\d+)?)")
+"""An entry of a trace's list of collisions, as SUMO's are written; those of a scenario of one's own may be any text."""
 _PERSON = 1.0
 _AHEAD, _BESIDE = 60.0, 7.0
 
@@ -155,14 +158,14 @@ def drove_on(trace: Trace, ego: str) -> list[tuple[str, str, float]]:
     Those that SUMO lists and whose bodies overlap: it lets both drive on.
     """
     found: dict[tuple[str, str], float] = {}
-    for text in trace.reported:
-        listed, _, at = text.rpartition("@")
-        pair = tuple(sorted(listed.split(">")))
-        k = int(np.searchsorted(trace.time, float(at) - _SAME))
-        if len(pair) == 2 and ego not in pair and set(pair) <= set(trace.actors) and k < len(trace.time) - 1:
-            a, b = (select_instants(trace.actor(name), slice(max(k - 1, 0), k + 2)) for name in pair)
-            if any((rectangle_distance(one, other) <= 0.0).any() for one, other in part_pairs(a, b)):
-                found.setdefault((pair[0], pair[1]), float(at))
+    for text in filter(None, map(_LISTED.fullmatch, trace.reported)):
+        a, b = sorted(text.group(1, 2))
+        t = float(text[3])
+        k = int(np.searchsorted(trace.time, t - _SAME))
+        if ego not in (a, b) and {a, b} <= set(trace.actors) and k < len(trace.time) - 1:
+            one, other = (select_instants(trace.actor(name), slice(max(k - 1, 0), k + 2)) for name in (a, b))
+            if any((rectangle_distance(p, q) <= 0.0).any() for p, q in part_pairs(one, other)):
+                found.setdefault((a, b), t)
     return [(*pair, t) for pair, t in found.items()]
 
 

@@ -25,8 +25,6 @@ __all__ = ["OwnEgo", "Suggestion", "own_ego"]
 
 _DEFAULT_CLASSES = {"DEFAULT_BIKETYPE": "bicycle", "DEFAULT_TAXITYPE": "taxi", "DEFAULT_RAILTYPE": "rail"}
 """Vehicle classes of the types that SUMO has without a definition."""
-_OF_FLOWS = ("id", "begin", "end", "number", "vehsPerHour", "perHour", "period", "probability", "departSpeed", "type")
-"""Attributes of a flow that a single vehicle has not, or that are replaced."""
 _MOST_FLOWS = 2
 """Flows that become inputs."""
 
