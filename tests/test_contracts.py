@@ -70,7 +70,8 @@ def test_scenarios(name):
 
 
 CHANGED = {
-    "infinite": (lambda trace: np.inf, "must be finite"),
+    "no number": (lambda trace: np.nan, "must be finite, inf or -inf"),
+    "infinite alone": (lambda trace: np.inf, "where the two never meet"),
     "raises": (lambda trace: 1 / 0, "must measure every trace, but m raised ZeroDivisionError"),
     "clock": (lambda trace: float(trace.time[-1]), "must not depend on when the run began"),
     "without": (lambda trace: 3.0, "where the two never meet"),
@@ -89,6 +90,7 @@ def test_the_metric_contract_finds(flaw):
 def test_the_metric_contract_wants_a_value_without_interaction_and_a_direction():
     good = Metric("m", lambda trace: 2.0, without=2.0)
     check_metric(good, traces())
+    check_metric(Metric("m", lambda trace: np.inf), traces())  # an end of the scale, as in docs/extending.md
     with pytest.raises(ContractError, match="must say its value without an interaction"):
         check_metric(replace(good, without=np.inf), [])
     with pytest.raises(ContractError, match="direction must be low or high, but got 'down'"):

@@ -9,16 +9,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import ndtri
 
-from sbt.campaigns.clustering import Spread, spread_of_draws, spread_of_share
-from sbt.campaigns.counting import DRAWN, FEW_KNOWN, Seen, counted_batches, counted_iterations, with_event
+from sbt.campaigns.batches import told_by_batches
+from sbt.campaigns.clustering import spread_of_draws, spread_of_share
+from sbt.campaigns.counting import DRAWN, Seen, counted_batches, counted_iterations, with_event
 from sbt.campaigns.crude import NOMINAL_STAGES, nominal_proportion, nominal_rows
 from sbt.campaigns.gate import Limits
 from sbt.campaigns.parts import CriticalShare, share_of
 from sbt.campaigns.records import EstimationProposal
 from sbt.campaigns.settings import Settings
 from sbt.campaigns.summing import summed, took_sum
+from sbt.campaigns.unviolated import Unviolated
 from sbt.campaigns.wording import number, percent
-from sbt.estimators.intervals import FEW_HITS, CombinedEstimate, CountedBatch, combine_estimates
+from sbt.estimators.intervals import CountedBatch
 from sbt.loop.stages import Log
 from sbt.problem.requirement import Requirement
 from sbt.store.history import History
@@ -96,34 +98,12 @@ def _from_batches(log: Log, settings: Settings, confidence: float) -> tuple[Requ
         safe, critical = (_batches_of(k, part, log, settings, failed_critical=failed) for failed in (False, True))
         if not safe:
             return None
-        low, high = combine_estimates(safe), combine_estimates(critical)
-        hits, misses = sum(batch.hits for batch in safe), sum(batch.misses for batch in safe)
-        few, value = min(hits, misses) < FEW_HITS, min(max(low.value, 0.0), 1.0)
-        if min(hits, misses) == 0:  # no variance is known: the draws from the inputs' distribution bound it
-            ends = _bounds(part, log, settings, tail)
-        else:
-            ends = _ends(spread_of_draws(log, safe, critical), value, low, high, few=few, confidence=tail)
-            seen = _seen(part, log, settings)
-            reaches = seen.known < FEW_KNOWN or seen.late
-            ends = ends[0], max(ends[1], seen.most_critical(tail)) if reaches else ends[1]
-        found.append(RequirementEstimate(part.label, value, min(ends[0], value), max(ends[1], value), hits))
+        told = told_by_batches(safe, critical, _seen(part, log, settings), Unviolated(), drawn_from="the inputs' distribution")
+        between = spread_of_draws(log, safe, critical)
+        limits = told.limits if between is None else between.widened(told.limits, told.value, told.highest)
+        ends = min(limits.lower(tail), told.value), max(limits.upper(tail), told.value)
+        found.append(RequirementEstimate(part.label, told.value, *ends, told.hits))
     return tuple(found)
-
-
-def _ends(
-    between: Spread | None, value: float, low: CombinedEstimate, high: CombinedEstimate, *, few: bool, confidence: float
-) -> tuple[float, float]:
-    """Return the ends of an interval, at least as wide as the spread between warm-ups says."""
-    limits = Limits(lambda c: low.limit(c, side=-1, few=few), lambda c: high.limit(c, side=1, few=few))
-    limits = limits if between is None else between.widened(limits, value, high.value)
-    return limits.lower(confidence), limits.upper(confidence)
-
-
-def _bounds(part: Requirement, log: Log, settings: Settings, confidence: float) -> tuple[float, float]:
-    """Return the exact limits of the probability of one requirement by the draws in proportion to the inputs' distribution."""
-    seen = _seen(part, log, settings)
-    safe = seen.draws - seen.hits - seen.failed
-    return 1.0 - seen.most(safe + seen.failed, confidence), seen.most_critical(confidence)
 
 
 def _seen(part: Requirement, log: Log, settings: Settings) -> Seen:

@@ -74,7 +74,7 @@ def _frames(trace: Trace, metric: Metric, requirement: Requirement, lanes: Seque
     last = len(trace.time) - 1
     instants = [*range(0, last, _every(trace)), last]
     moment, opponent = worst_moment(trace, metric)
-    size = _WIDE if is_wide(trace, opponent, moment) else _TALL
+    size = _WIDE if is_wide(trace, opponent) else _TALL
     figure = Figure(figsize=size, dpi=_DPI)
     canvas: Any = FigureCanvasAgg(figure)
     above, below = _two_axes(figure, size)

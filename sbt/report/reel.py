@@ -70,7 +70,7 @@ class Reels:
         moment, opponent = worst_moment(trace, film.metric)
         step = max(-(-len(trace.time) // _INSTANTS), 1)
         at = np.unique(np.concatenate([np.arange(0, len(trace.time), step), [moment, len(trace.time) - 1]]))
-        ratio = _WIDE if is_wide(trace, opponent, moment) else _TALL
+        ratio = _WIDE if is_wide(trace, opponent) else _TALL
         view = view_of(trace, opponent, moment, ratio)
         origin = np.round(view.middle[0])
         shown = _nearest(trace, opponent)
@@ -87,14 +87,12 @@ class Reels:
                 {"time": float(trace.time[c.instant]), "with": c.other, "x": float(c.x - origin[0]), "y": float(c.y - origin[1])}
                 for c in contacts_of(trace)[:5]
             ],
-            "lanes": self._around(film.lanes, view.middle, (view.half_x, view.half_y), origin),
+            "lanes": self._around(film.lanes, view.middle, (view.half_x, view.half_y)),
             "origin": origin.tolist(),
             "curves": _curves(film, at, opponent), "view": _view(trace, shown),
         }  # fmt: skip
 
-    def _around(
-        self, lanes: Sequence[Lane], middle: np.ndarray, half: tuple[float, float], origin: np.ndarray
-    ) -> list[int]:
+    def _around(self, lanes: Sequence[Lane], middle: np.ndarray, half: tuple[float, float]) -> list[int]:
         """Return the positions of the lanes that can be seen, the lowest first."""
         reach = np.array(half) + _MARGIN
         low, high = middle.min(axis=0) - reach, middle.max(axis=0) + reach

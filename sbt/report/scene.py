@@ -174,7 +174,7 @@ def view_of(trace: Trace, opponent: int | None, moment: int, ratio: float) -> Vi
     return View(_smoothed(place + ahead, trace.time), half, half / ratio, follows=True)
 
 
-def is_wide(trace: Trace, opponent: int | None, moment: int) -> bool:
+def is_wide(trace: Trace, opponent: int | None) -> bool:
     """Return whether all that matters happens along the x axis, so that a wide view suits it."""
     y = trace.y[:, [0] if opponent is None else [0, opponent]]
     x = trace.x[:, [0] if opponent is None else [0, opponent]]

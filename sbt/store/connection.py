@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import sqlite3
@@ -71,10 +72,17 @@ def _copied(path: Path, log: Path) -> sqlite3.Connection:
 
 
 def copy_database(source: Path, target: Path) -> None:
-    """Write a copy of a file, as it was at one moment; a process may be writing it."""
+    """Write a copy of a file, as it was at one moment; a process may be writing it.
+
+    Raises:
+        OSError: the disk is full.
+    """
     with closing(connected(source)) as db, closing(sqlite3.connect(with_room(target.parent) / target.name)) as copy:
-        db.backup(copy)
-        copy.execute("PRAGMA journal_mode = DELETE")  # one file, which may lie where nobody may write
+        try:
+            db.backup(copy)
+            copy.execute("PRAGMA journal_mode = DELETE")  # one file, which may lie where nobody may write
+        except sqlite3.OperationalError as error:
+            raise OSError(errno.EIO, str(error), str(target)) from error
 
 
 def set_journal(db: sqlite3.Connection, *, durable: bool) -> str:

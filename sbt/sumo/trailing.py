@@ -30,8 +30,6 @@ _JUMP = 3.0
 """Distance (m) beyond what the speed explains, from which on a vehicle has been moved and not driven."""
 
 Point = tuple[float, float]
-Pose = tuple[float, float, float]
-"""x, y (m) and heading (rad) of the middle of a rectangle."""
 _LeadsTo = Callable[[str, str, float, Point], bool]
 _Instant = tuple[int, int, float, float, float, float]
 """Number of the path, of its points, x and y of the front (m), cosine and sine of the heading."""

@@ -155,7 +155,7 @@ def check_sampler(propose: Callable[[int, int], Points], *, dimension: int, seed
 
 
 def check_metric(metric: Metric, traces: Iterable[Trace]) -> None:
-    """Check a safety metric: a finite, pure function of the trace that says what it gives without an interaction.
+    """Check a safety metric: a pure function of the trace, never NaN, that says what it gives without an interaction.
 
     Args:
         metric: measures the actors `ego` and `co`, or all of them.
@@ -164,7 +164,8 @@ def check_metric(metric: Metric, traces: Iterable[Trace]) -> None:
     Raises:
         ContractError: a law is broken.
     """
-    _require(math.isfinite(metric.without), "a metric must say its value without an interaction", str(metric.without))
+    alone, said = _measured(metric, _apart()), metric.without
+    _require(math.isfinite(said) or alone == said, "a metric must say its value without an interaction", str(said))
     _require(metric.direction in ("low", "high"), "a metric's direction must be low or high", repr(metric.direction))
     for trace in traces:
         before, y = _copy(trace), _measured(metric, trace)
@@ -173,7 +174,6 @@ def check_metric(metric: Metric, traces: Iterable[Trace]) -> None:
         _require(again == y, "the same trace must give the same value, bit by bit", f"{again} after {y}")
         later = _measured(metric, dataclasses.replace(before, time=before.time + 64.0))
         _close(np.array([later]), np.array([y]), 1e-9, "a metric must not depend on when the run began")
-    alone = _measured(metric, _apart())
     _close(np.array([alone]), np.array([metric.without]), 1e-9, "where the two never meet a metric must give its `without`")
 
 
@@ -267,13 +267,13 @@ def _check_conclusion(result: Result[Any], case: str) -> None:
 
 
 def _measured(metric: Metric, trace: Trace) -> float:
-    """Return the value, finite."""
+    """Return the value, finite or an end of the scale."""
     try:
         value = float(metric(trace))
     except RAISED as error:
         rule = "not change the trace" if "read-only" in str(error) else "measure every trace"
         raise ContractError(f"a metric must {rule}, but {metric.name} raised {error!r}") from error
-    _require(math.isfinite(value), "a metric must be finite", f"{value} of {metric.name}")
+    _require(not math.isnan(value), "a metric must be finite, inf or -inf", f"{value} of {metric.name}")
     return value
 
 

@@ -130,7 +130,7 @@ def pin_runs(folder: Path, runs: Sequence[str], into: Path) -> Path:
         _check_levels(indices, store.history(level=None))
     replays = [replay_run(folder, index, execute=True) for index in indices]
     for again in replays:
-        _check(again, folder)
+        _check(again)
     into.mkdir(parents=True, exist_ok=True)
     configuration, place = _configuration(text), place if _names_files(study) else into
     warm_ups = int((kept.get("isolation") or {}).get("seeds", 0))
@@ -195,7 +195,7 @@ def _check_levels(indices: Sequence[int], history: History) -> None:
         raise InputError(f"{rule} (level {level[row]} of fidelity), which counts as no failure")
 
 
-def _check(again: Replay, folder: Path) -> None:
+def _check(again: Replay) -> None:
     record = again.record
     if record.status != Status.OK or not again.as_stored:
         now = f"{again.differing or again.outcome.status} {again.outcome.reason}".strip()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import os
-import sqlite3
 import zipfile
 from contextlib import suppress
 from pathlib import Path
@@ -109,7 +108,6 @@ def write_bundle(store: Path, folder: Path, target: Path) -> list[Path]:
 
     try:
         write_atomically(target, write)
-    except (OSError, sqlite3.OperationalError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(f"a bundle must be written into a folder that may be written, but {target}: {reason}") from None
+    except OSError as error:
+        raise InputError(f"a bundle must be written into a folder that may be written, but {target}: {error.strerror}") from None
     return files

@@ -121,7 +121,7 @@ def predict_inputs(
         study, history = Study.from_store(store, objects=objects), store.history()
     learner, choice = study.learner, study.config.metamodel
     if learner is None or choice is None:
-        raise InputError(f"predict needs a campaign with a metamodel, but of {folder} {study.unlearned}")
+        raise InputError(f"predict needs a campaign with a metamodel, but of {folder} {_why_none(study)}")
     space, requirement = study.scenario.space, study.scenario.requirement.in_units_of(history)
     x, ignored = read(space)
     learner, training = learner.telling(history), history.finished
@@ -141,6 +141,14 @@ def predict_inputs(
     if (success := learner.success(history)) is not None:
         columns["p_fails"] = -np.expm1(success(space.to_unit(x)))
     return Table(space, x, columns, requirement.told_as, choice.kind, len(training), source, ignored)
+
+
+def _why_none(study: Study) -> str:
+    """Return in words why a campaign has no metamodel, and what would give one."""
+    method = study.config.acquisition.kind
+    if method in study.kind.metamodel_free:
+        return f"acquisition {method} learns none (a boundary with warm_start learns from its runs)"
+    return "it has none (add metamodel: {kind: auto})"
 
 
 def inputs_from(given: Any, space: ParameterSpace) -> tuple[Points, tuple[str, ...]]:

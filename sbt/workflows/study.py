@@ -262,14 +262,6 @@ class Study:
         known = self.earlier_campaign().pooled(learner, config) if kept is None else EarlierRuns.from_json(kept)
         return replace(learner, earlier=known)
 
-    @property
-    def unlearned(self) -> str:
-        """Why there is no metamodel, and what would give one, in words."""
-        method = self.config.acquisition.kind
-        if method in self.kind.metamodel_free:
-            return f"acquisition {method} learns none (a boundary with warm_start learns from its runs)"
-        return "it has none (add metamodel: {kind: auto})"
-
     def earlier_campaign(self) -> EarlierCampaign:
         """Return the campaign that `warm_start` names.
 
