@@ -118,6 +118,15 @@ def test_a_gap_or_a_jump_begins_a_new_interval(tmp_path):
     assert near_pairs(recording, 19.0) == []
 
 
+@pytest.mark.parametrize(("moved", "spans"), [(3.0, [(0, 11)]), (12.0, [(0, 5), (6, 11)])])
+def test_a_walker_who_is_put_over_a_junction_begins_a_new_interval(moved: float, spans: list[tuple[int, int]], tmp_path):
+    """SUMO puts walkers up to 3.4 m aside onto crossings; without walking areas over the junction, 10 to 17 m in a step."""
+    rows = [row(t, "ped", 0.0, 1.2 * t + (moved if t >= 6 else 0), 0.0, 1.2) for t in np.arange(12.0)]
+    rows += [row(t, "a", 10.0 * t) for t in np.arange(12.0)]
+    recording = read_fcd(written(tmp_path, "a.xml", as_xml(rows)))
+    assert [(t.time[0], t.time[-1]) for t in pair_traces(recording, 0, 1)] == spans
+
+
 def test_no_acceleration_is_taken_across_a_gap_or_a_jump(tmp_path):
     """Who was teleported from 20 m/s to a standstill had braked with 200 m/s^2, who stood after a gap with 2."""
     times = np.round(np.arange(0.0, 12.0, 0.1), 1)

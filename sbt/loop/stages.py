@@ -140,7 +140,7 @@ _MOVED = {
     ),
     Doubt.CROSSED: (
         "a road user near the ego was moved over a junction within a step",
-        ": metrics see it leave and come (column unconfirmed; the network has no lanes inside junctions)",
+        ": metrics see it leave and come (column unconfirmed; the network has no lanes, or no walking areas, inside junctions)",
     ),
     Doubt.STOPPED: (
         "another road user brakes as no vehicle can",

@@ -26,6 +26,7 @@ from sbt.problem.trace import ActorTrace, select_parts
 
 __all__ = [
     "LANE_CHANGE",
+    "STEPPED",
     "Rectangles",
     "contact_index",
     "contact_moment",
@@ -48,6 +49,8 @@ __all__ = [
 
 LANE_CHANGE = 8.0
 """How far SUMO may move a road user beside what it drives, where it changes lanes within a step (m)."""
+STEPPED = 4.0
+"""How far SUMO may move a walker beside its way, onto a crossing or a walking area (m): 3.4 in 2 million steps, four networks."""
 _MAX_SPEED = 150.0
 _DRIVES, _TURNED, _SWINGS, _ARCS = 0.5, 0.05, 0.3, 16
 """A step in which a corner moves by more than this (m) because its rectangle turns is one along an arc, of so many parts; by more

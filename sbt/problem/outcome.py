@@ -69,7 +69,7 @@ class Doubt(StrEnum):
     TELEPORTED = "somebody near the ego was teleported"
     """a road user was moved to another place, such as by SUMO out of a jam"""
     CROSSED = "somebody near the ego was moved over a junction"
-    """within a step, as the network has no lanes inside junctions"""
+    """within a step, as the network has no lanes, or no walking areas, inside junctions"""
     STOPPED = "another road user was stopped dead"
     """a road user brakes by more than tyres hold, such as SUMO lets one before a red light or where its lane ends"""
     DROVE_ON = "others near the ego collided and drove on"

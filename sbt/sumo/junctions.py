@@ -1,19 +1,30 @@
-"""Networks without lanes inside junctions, over which SUMO moves road users within a step."""
+"""Networks without lanes, or walking areas, inside junctions, over which SUMO moves road users within a step."""
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
-__all__ = ["WHY_JUMPED", "Junctions", "told_of_junctions"]
+from sbt.metrics.geometry import STEPPED
+
+__all__ = ["Junctions", "told_of_junctions", "why_jumped"]
 
 _FASTER, _FURTHER = 1.3, 1.0
 """How far nobody gets without a jump: this times its speed, as outer lanes of a bend are longer, and so far (m) beside that."""
+_PAVEMENT = {"pedestrian", "wheelchair"}
+_WALKING_AREA = re.compile(r":.*_w\d+")
 _REMEDY = "make it, and run SUMO, without no-internal-links"
-WHY_JUMPED = f", as the network has no lanes inside junctions: {_REMEDY}"
-"""The end of a message about an ego that was moved over a junction within a step."""
+_WALKING_REMEDY = "make it with netconvert's crossings.guess or walkingareas"
+
+
+def why_jumped(*, walks: bool) -> str:
+    """Return the end of a message about an ego that was moved over a junction within a step."""
+    if walks:
+        return f", as the network has no walking area there: {_WALKING_REMEDY}"
+    return f", as the network has no lanes inside junctions: {_REMEDY}"
 
 
 class Junctions:
@@ -33,6 +44,11 @@ class Junctions:
         if not left_out and any(edge.startswith(":") for edge in self._sumo.edge.getIDList()):
             return False
         return any(_ends_before_next(self._sumo.lane, lane) for lane in self._sumo.lane.getIDList())
+
+    @cached_property
+    def lack_walking_areas(self) -> bool:
+        """Whether the network that SUMO has loaded has no walking areas: walkers are put onto the next pavement."""
+        return not any(map(_WALKING_AREA.fullmatch, self._sumo.edge.getIDList()))
 
     def jumped(
         self, name: str, last: Sequence[float], at: tuple[float, float], heading: float, half: float, driven: float
@@ -55,19 +71,25 @@ class Junctions:
     def explain(self, name: str, moved: float, driven: float, *, walks: bool = False) -> bool:
         """Return whether a junction explains that one was moved so far (m), further than it can have driven (m)."""
         most = _FASTER * driven + _FURTHER
+        if walks and moved > most:
+            return self.lack_walking_areas or moved > most - _FURTHER + STEPPED
         if moved <= most or not self.lack_lanes:
             return False
-        return walks or 0.0 <= self._sumo.vehicle.getLanePosition(name) <= most  # has just entered its edge
+        return 0.0 <= self._sumo.vehicle.getLanePosition(name) <= most  # has just entered its edge
 
 
 def told_of_junctions(sumo: Any) -> str:
-    """Return in words that SUMO's network has junctions of some width, and no lanes inside them; "" elsewhere."""
-    if not Junctions(sumo).lack_lanes:
-        return ""
-    return (
-        "the network has no lanes inside junctions, so that SUMO moves road users over one within a step: an ego there"
-        f" makes its run invalid, and the tracks of others are interrupted there; {_REMEDY}"
-    )
+    """Return in words that SUMO's network has junctions of some width, and no lanes inside them, or no walking areas."""
+    junctions, said = Junctions(sumo), []
+    if junctions.lack_lanes:
+        said.append(("lanes inside junctions", "road users", "an ego", _REMEDY))
+    allowed = (set(sumo.lane.getAllowed(lane)) for lane in sumo.lane.getIDList())
+    if junctions.lack_walking_areas and any(who and who <= _PAVEMENT for who in allowed):
+        said.append(("walking areas at junctions of its pavements", "walkers", "an ego on foot", _WALKING_REMEDY))
+    return "; ".join(
+        f"the network has no {lacks}, so that SUMO moves {who} over one within a step: {ego} there makes its run"
+        f" invalid, and the tracks of others are interrupted there; {remedy}" for lacks, who, ego, remedy in said
+    )  # fmt: skip
 
 
 def _ends_before_next(lanes: Any, lane: str) -> bool:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from sbt.errors import RunError
-from sbt.metrics.geometry import LANE_CHANGE, contact_part, farthest
+from sbt.metrics.geometry import LANE_CHANGE, STEPPED, contact_part, farthest
 from sbt.problem.outcome import Status
 from sbt.problem.trace import ActorTrace, States, Trace
 from sbt.sumo.actors import State
@@ -274,7 +274,8 @@ class Surroundings:
 
     def _note_jump(self, name: str, moved: float, *, crossed: bool) -> None:
         """Leave out a road user that was moved to another place, or over a junction; the ego must not be."""
-        self._teleports.jump(name, len(self._rows) * self._dt, moved, crossed=crossed)  # t of the row that is being made
+        t, walks = len(self._rows) * self._dt, self.is_person(name)  # of the row that is being made
+        self._teleports.jump(name, t, moved, crossed=crossed, walks=walks)
         self.jumped.add(name)
 
     def _first_seen(self, name: str, variables: Mapping[int, Any]) -> State:
@@ -291,12 +292,13 @@ class Surroundings:
     def touching(self) -> list[tuple[str, ActorTrace, ActorTrace]]:
         """Return who has touched the ego since the last step, with the rectangles that touch: the ego's and the other's."""
         ego, found = self.states[self._ego], []
-        x, y, reach_0 = ego.x, ego.y, 1.5 * ego.length
+        x, y, reach_0, walks = ego.x, ego.y, 1.5 * ego.length, self.is_person(self._ego)
         for name in self.present:
             if name == self._ego:
                 continue
             other = self.states[name]
-            reach = reach_0 + 1.5 * other.length + (ego.speed + other.speed) * self._dt
+            beside = STEPPED if walks or self.is_person(name) else 0.0
+            reach = reach_0 + 1.5 * other.length + (ego.speed + other.speed) * self._dt + beside
             if abs(other.x - x) > reach or abs(other.y - y) > reach:
                 continue
             touched = contact_part(self._step_of(self._ego, name), self._step_of(name, name)) if self._near(name) else None

@@ -7,7 +7,7 @@ from typing import Any
 
 from sbt.errors import RunError
 from sbt.problem.outcome import CROSSED, TELEPORTED, Status
-from sbt.sumo.junctions import WHY_JUMPED
+from sbt.sumo.junctions import why_jumped
 
 __all__ = ["Teleports"]
 
@@ -40,14 +40,14 @@ class Teleports:
         self._begun = of.getStartingTeleportIDList() if of.getStartingTeleportNumber() else ()
         self.ending = of.getEndingTeleportIDList() if of.getEndingTeleportNumber() else ()
 
-    def jump(self, name: str, t: float, moved: float, *, crossed: bool = False) -> None:
+    def jump(self, name: str, t: float, moved: float, *, crossed: bool = False, walks: bool = False) -> None:
         """Note one who was moved that far (m) within the step to t (s); crossed: over a junction without lanes inside.
 
         Raises:
             RunError: it is the ego.
         """
         if name == self._ego:
-            how = f"was moved by {moved:.0f} m within a step at {t:.3f} s{WHY_JUMPED if crossed else ''}"
+            how = f"was moved by {moved:.0f} m within a step at {t:.3f} s{why_jumped(walks=walks) if crossed else ''}"
             raise RunError(Status.INVALID, f"the ego '{name}' must stay on its way, but {how}")
         self._note(name, t, f"it was moved by {moved:.0f} m, and its track is interrupted", CROSSED if crossed else TELEPORTED)
 
