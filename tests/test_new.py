@@ -81,6 +81,23 @@ def test_a_vehicle_called_ego_is_the_one_under_test(tmp_path):
 
 @needs_tools
 @pytest.mark.sumo
+def test_a_bicycle_under_test_departs_no_faster_than_it_rides(tmp_path):
+    """It was to depart with up to .8 of the lane's limit, which SUMO refuses: all corners of the inputs were invalid."""
+    config = make("numeric", tmp_path / "case")
+    trips = tmp_path / "case" / "t.trips.xml"
+    bike = '<vType id="bike" vClass="bicycle"/>'
+    text = re.sub("(<routes[^>]*>)", rf"\1{bike}", trips.read_text(), count=1)
+    trips.write_text(text.replace('id="40"', 'id="40" type="bike"'))
+    called("new", tmp_path / "study", "--from", config, "--ego", "40")
+    scenario = ScenarioSpec(str(tmp_path / "study" / "scenario.yaml")).resolve()
+    (speed,) = (p for p in scenario.space.parameters if p.name == "depart_speed")
+    assert speed.high == pytest.approx(0.8 * 20.0 / 3.6, abs=0.05)
+    values = {p.name: p.centre for p in scenario.space.parameters} | {"depart_speed": speed.high}
+    assert scenario.simulate(values, 3).speed[0, 0] == pytest.approx(speed.high, abs=1e-3)
+
+
+@needs_tools
+@pytest.mark.sumo
 @pytest.mark.parametrize("name", QUICK)
 def test_what_new_writes_runs(name, tmp_path):
     folder, _ = new(name, tmp_path)

@@ -46,7 +46,7 @@ class Observed:
         depart: when it entered (s).
         delay: how much later than it should (s).
         route: edges, as they were when it entered.
-        lane_speed: speed limit of its first lane (m/s).
+        lane_speed: that its first lane, and what its class wants, allow it at a speed factor of 1 (m/s).
         running: vehicles on the road when it entered.
         stay: how long it drove (s), so far if it was still there in the end.
         neighbours: mean number of others within 50 m.
@@ -141,10 +141,10 @@ def _watch(sumo: Any, wanted: str | None) -> Traffic:
 
 def _entered(sumo: Any, name: str, running: int) -> Observed:
     vehicle = sumo.vehicle
-    lane = vehicle.getLaneID(name)
+    allowed = vehicle.getAllowedSpeed(name) / vehicle.getSpeedFactor(name) if vehicle.getLaneID(name) else 0.0
     return Observed(
         name, vehicle.getTypeID(name), vehicle.getVehicleClass(name), float(vehicle.getDeparture(name)),
-        float(vehicle.getDepartDelay(name)), tuple(vehicle.getRoute(name)), float(sumo.lane.getMaxSpeed(lane)) if lane else 0.0,
+        float(vehicle.getDepartDelay(name)), tuple(vehicle.getRoute(name)), float(allowed),
         running,
     )  # fmt: skip
 
