@@ -105,7 +105,7 @@ _RETURN = 0.5
 _SEARCHED = 1000
 """Runs that searches learn from at most: they look for regions, not for their edges, and cost the square of them."""
 _SURPRISE = 0.01
-"""P of an earlier metamodel below which a critical run since then refutes it."""
+"""P of what a run since then was, by an earlier metamodel, below which it refutes that."""
 
 
 @dataclass(frozen=True)
@@ -359,8 +359,8 @@ class SequentialStage:
     def _fallback(self, log: Log, known: Known, error: float) -> LogProbability | None:
         """Return an earlier metamodel to draw with, where the newest one has lost its precision for no reason.
 
-        It is used where no critical run since then lay where that metamodel denied it. The estimate is unbiased with any
-        metamodel that knows only earlier runs.
+        It is used where no run since then was critical where that metamodel denied it, or uncritical where it was as sure. The
+        estimate is unbiased with any metamodel that knows only earlier runs.
         """
         iteration = steadier(log, error)
         if iteration is None:
@@ -370,9 +370,9 @@ class SequentialStage:
         since = known.batch >= iteration
         if log_probability is None or not since.any():
             return None
-        met = known.z[since & known.critical]
-        surprised = len(met) > 0 and bool((np.exp(log_probability(met)[0]) < _SURPRISE).any())
-        return None if surprised else log_probability
+        p = np.exp(log_probability(known.z[since])[0])
+        surprised = np.where(known.critical[since], p, 1.0 - p) < _SURPRISE
+        return None if surprised.any() else log_probability
 
 
 def _gain(pi: Vector) -> float:

@@ -22,6 +22,7 @@ from sbt.plugins import kept, noted
 from sbt.problem.arrays import Vector
 from sbt.problem.outcome import Status
 from sbt.sumo.guided import Motion, Placed
+from sbt.sumo.junctions import Junctions
 from sbt.sumo.levels import levels_of
 from sbt.sumo.session import unwrapped
 from sbt.sumo.template import fill
@@ -29,9 +30,9 @@ from sbt.sumo.template import fill
 __all__ = ["RecordedTraffic", "Track", "recorded_tracks"]
 
 _TYPE = "sbt_recorded"
-"""Id of the vehicle type of recorded vehicles; its class may use every lane."""
-_KEEP_ROUTE = 2
-"""keepRoute of moveToXY that keeps the pose exactly, on or off the lanes."""
+"""Id of the vehicle type of recorded vehicles; its class may use every lane, where there are no walking areas."""
+_KEEP_ROUTE, _KEEP_EDGE = 2, 3
+"""keepRoute of moveToXY that keeps the pose exactly, on or off the lanes; the latter leaves a person on its edge for SUMO."""
 _GAP = 1.5
 """A track is interrupted where two of its instants are further apart than so many of its usual steps."""
 _SLACK = 1e-6
@@ -195,7 +196,9 @@ class _Replay:
         self._edge = next(edge for edge in sumo.edge.getIDList() if not edge.startswith(":"))
         sumo.route.add(_TYPE, [self._edge])
         sumo.vehicletype.copy("DEFAULT_VEHTYPE", _TYPE)
-        sumo.vehicletype.setVehicleClass(_TYPE, "ignoring")
+        mapped = Junctions(sumo).lack_walking_areas  # SUMO 1.28 crashes where it takes one for the lane of who is moved by poses
+        sumo.vehicletype.setVehicleClass(_TYPE, "ignoring" if mapped else "passenger")
+        self._keep_person = _KEEP_ROUTE if mapped else _KEEP_EDGE
         sumo.vehicletype.setMaxSpeed(_TYPE, float(farthest(1.0)))
 
     def before_step(self, t: float | None) -> None:
@@ -215,7 +218,7 @@ class _Replay:
                 continue
             x, y, angle, speed, z = states.pop()
             if person:
-                self._move_person(name, "", x, y, angle, _KEEP_ROUTE)
+                self._move_person(name, "", x, y, angle, self._keep_person)
             else:
                 self._move_vehicle(name, "", -1, x, y, angle, _KEEP_ROUTE)
             self._placed[name] = Placed(x, y, angle, speed, person, z)
