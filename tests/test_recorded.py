@@ -281,7 +281,8 @@ def test_recorded_road_users_on_crossings_do_not_crash_sumo(tmp_path: Path):
         "requirement: {metric: distance_min, critical: [-.inf, 0]}\n"
     )
     (tmp_path / "alone.py").write_text(
-        "import sbt\nrun = sbt.simulate('scenario.yaml', {'v': 2.0}, seed=1)\nprint(run.outcome.status, run.trace.actor.nunique())\n"
+        "import sbt\nrun = sbt.simulate('scenario.yaml', {'v': 2.0}, seed=1)\n"
+        "print(run.outcome.status, run.trace.actor.nunique())\n"
     )
     done = subprocess.run([sys.executable, "alone.py"], cwd=tmp_path, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr[-500:]
