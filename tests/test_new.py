@@ -81,6 +81,19 @@ def test_a_vehicle_called_ego_is_the_one_under_test(tmp_path):
 
 @needs_tools
 @pytest.mark.sumo
+def test_why_nothing_departs_is_told_by_sumo(tmp_path):
+    config = make("numeric", tmp_path / "case")
+    trips = tmp_path / "case" / "t.trips.xml"
+    text = trips.read_text()
+    first = re.search('<trip id="0"[^>]*>', text)[0]
+    trips.write_text(text.replace(first, "").replace("</routes>", f"{first}</routes>"))
+    done = CliRunner().invoke(app, ["new", str(tmp_path / "study"), "--from", str(config), "--ego", "0"])
+    assert done.exit_code == 2
+    assert "should be sorted by departure time" in done.output
+
+
+@needs_tools
+@pytest.mark.sumo
 def test_a_bicycle_under_test_departs_no_faster_than_it_rides(tmp_path):
     """It was to depart with up to .8 of the lane's limit, which SUMO refuses: all corners of the inputs were invalid."""
     config = make("numeric", tmp_path / "case")

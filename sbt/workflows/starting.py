@@ -17,10 +17,12 @@ from sbt.sumo.departures import HELD_BACK
 from sbt.sumo.files import SumoFiles, options_of_config
 from sbt.sumo.observing import Observed, Traffic, candidates, observe
 from sbt.sumo.own_ego import Suggestion, own_ego
+from sbt.sumo.session import session
 from sbt.sumo.suggesting import suggested
 
 __all__ = ["Written", "write_scenario"]
 
+_SAID = 3  # lines of SUMO that an error quotes at most
 _TRIED = 4
 """Vehicles that are tried at most, until one departs as asked at every end of the inputs."""
 _STEP = 0.1
@@ -168,12 +170,19 @@ def write_scenario(folder: Path, config: Path, ego: str | None = None) -> Writte
         if trial.fine:
             break
     if best is None:
-        raise InputError(f"{config}: a road vehicle must depart, but none did while the traffic was watched; name one: --ego ID")
+        none = f"none did while the traffic was watched{_warned()}"
+        raise InputError(f"{config}: a road vehicle must depart, but {none}; name one: --ego ID")
     _write(best[1], folder, made)
     budget = max(_BUDGET[0], min(_BUDGET[1], int(_MINUTE / max(best[0].seconds, 1e-3))))
     campaign = _CAMPAIGN.format(folder=folder, budget=budget, initial=budget // 2)
     made.add(write_atomically(folder / "campaign.yaml", campaign))
     return Written(tuple(sorted(made)), (f"the vehicle under test: {best[1].why}", *best[0].said()))
+
+
+def _warned() -> str:
+    """Return what SUMO said of the files, such as that it ignores what is not sorted; "" if nothing."""
+    said = [line for line in dict.fromkeys(session().messages()) if line.startswith(("Warning:", "Error:"))]
+    return f" ({'; '.join(said[:_SAID])})" if said else ""
 
 
 def _drafts(files: SumoFiles, config: Path, folder: Path, ego: str | None) -> Iterator[_Draft]:
@@ -188,7 +197,7 @@ def _drafts(files: SumoFiles, config: Path, folder: Path, ego: str | None) -> It
     if ego is not None:
         chosen = traffic.get(ego) or next((v for v in traffic.vehicles if v.id.rpartition(".")[0] == ego), None)
         if chosen is None:
-            raise InputError(f"--ego must depart, but '{ego}' did not while the traffic was watched")
+            raise InputError(f"--ego must depart, but '{ego}' did not while the traffic was watched{_warned()}")
         choice = [chosen]
     else:
         named = [v for v in traffic.vehicles if v.id.lower() == "ego"]
