@@ -13,8 +13,9 @@ from sbt.campaigns.settings import Settings
 from sbt.errors import InputError
 from sbt.estimators.choices import choice_scores
 from sbt.estimators.events import given_a_metric, with_failed_runs
-from sbt.estimators.surrogate import Coordinates, LogProbability, fit_log_probability
-from sbt.metamodels.base import Metamodel
+from sbt.estimators.surrogate import QUANTILE, Coordinates, LogProbability, fit_log_probability
+from sbt.metamodels.base import Metamodel, fitted, predicted
+from sbt.metamodels.warp import Warp
 from sbt.problem.arrays import Mask, Points, Vector
 from sbt.store.history import History
 
@@ -115,6 +116,27 @@ class Known:
         )  # fmt: skip
         ok = np.arange(len(self.z) + len(self.failed)) < len(self.z)
         return with_failed_runs(given, self.coordinates, np.vstack([self.z, self.failed]), ok, rng)
+
+    def off(self, u: Points, y: Points | Vector, rng: np.random.Generator) -> Vector:
+        """Return how many standard deviations metrics are from what a metamodel of these runs tells, the largest of each run.
+
+        Args:
+            u: (m, d) coordinates of other runs.
+            y: (m,) or (m, q) their metrics.
+            rng: of the fit.
+        """
+        own, others = (np.reshape(each, (len(each), -1)) for each in (self.y, y))
+        found = np.zeros(len(y))
+        for k, part in enumerate(self.settings.scenario.requirement.parts):
+            known, told = np.isfinite(own[:, k]), np.isfinite(others[:, k])
+            if known.sum() < 2 or not told.any():
+                continue
+            warp = Warp.around_edge(own[known, k], part.critical, quantile=QUANTILE)
+            predictor = fitted(metamodel_of(self.settings), self.u[known], warp.values(own[known, k]), rng)
+            p = predicted(predictor, u[told])
+            far = np.abs(warp.values(others[told, k]) - p.mu) / np.maximum(p.sigma, 1e-300)
+            found[told] = np.maximum(found[told], far)
+        return found
 
     def attempts(self) -> tuple[Points, Vector, Vector]:
         """Return normal scores (n, d), metric (n,) and batch (n,) of all runs; the metric is NaN where a run failed."""

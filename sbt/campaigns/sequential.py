@@ -106,6 +106,8 @@ _SEARCHED = 1000
 """Runs that searches learn from at most: they look for regions, not for their edges, and cost the square of them."""
 _SURPRISE = 0.01
 """P of what a run since then was, by an earlier metamodel, below which it refutes that."""
+_OFF = 8.0
+"""Standard deviations by which its metric may be off: with heavy tails that is rarely so, and the newest metamodel draws."""
 
 
 @dataclass(frozen=True)
@@ -359,8 +361,8 @@ class SequentialStage:
     def _fallback(self, log: Log, known: Known, error: float) -> LogProbability | None:
         """Return an earlier metamodel to draw with, where the newest one has lost its precision for no reason.
 
-        It is used where no run since then was critical where that metamodel denied it, or uncritical where it was as sure. The
-        estimate is unbiased with any metamodel that knows only earlier runs.
+        It is used where no run since then denies that metamodel: critical, or not, where it was sure of the other, or with a
+        metric that it did not expect. The estimate is unbiased with any metamodel that knows only earlier runs.
         """
         iteration = steadier(log, error)
         if iteration is None:
@@ -371,8 +373,9 @@ class SequentialStage:
         if log_probability is None or not since.any():
             return None
         p = np.exp(log_probability(known.z[since])[0])
-        surprised = np.where(known.critical[since], p, 1.0 - p) < _SURPRISE
-        return None if surprised.any() else log_probability
+        denied = np.where(known.critical[since], p, 1.0 - p) < _SURPRISE
+        off = before.off(known.u[since], known.y[since], stream(self.settings.seed, "deny", iteration)) > _OFF
+        return None if (denied | off).any() else log_probability
 
 
 def _gain(pi: Vector) -> float:

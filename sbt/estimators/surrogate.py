@@ -37,7 +37,10 @@ from sbt.problem.cube import Cube
 from sbt.problem.requirement import CriticalInterval, as_passed
 from sbt.problem.space import ParameterSpace
 
-__all__ = ["MOST_LEARNED", "Coordinates", "JointLogProbability", "LogProbability", "fit_log_probability", "settled", "sketch_of"]
+__all__ = [
+    "MOST_LEARNED", "QUANTILE", "Coordinates", "JointLogProbability", "LogProbability", "fit_log_probability", "settled",
+    "sketch_of",
+]  # fmt: skip
 
 LogProbability = Callable[[Points], tuple[Vector, Vector]]
 """(n, d) normal scores to (n,) log P(critical) and (n,) log P(uncritical)."""
@@ -45,7 +48,7 @@ LogProbability = Callable[[Points], tuple[Vector, Vector]]
 MOST_LEARNED = 2000
 """Runs, drawn at random, that a Gaussian process of an estimation learns from at most: a proposal costs their square."""
 _REACH = 5.0  # normal scores from -5 to 5 are the unit interval: 6e-7 of the distribution lies beyond
-_QUANTILE = 0.5  # of the distances to the edge: the scale of the warp; a smaller one becomes a step as runs gather there
+QUANTILE = 0.5  # of the distances to the edge: the scale of the warp; a smaller one becomes a step as runs gather there
 _NOISE_COUNTS = 0.1  # of the usual distance to the edge: a standard deviation among repeats, beyond which it is learned in full
 _FEWEST_SCORED = 16  # runs from which on forms are compared
 _HELD_OUT, _MOST_SCORED = 3, 150  # one run in so many scores the forms, of at most so many
@@ -296,7 +299,7 @@ def fit_log_probability(
         if belief is not None:
             return lambda points: belief(coordinates(points), points).log_probability(edges)
     better = _better_warp(metamodel, u, y, critical)
-    warp = better or Warp.around_edge(y, critical, quantile=_QUANTILE)
+    warp = better or Warp.around_edge(y, critical, quantile=QUANTILE)
     t = warp.values(y)
     metamodel = _for_uneven_noise(metamodel, u, t, rng) if least > 0.0 else metamodel
     smallest = _noise_in(warp, z, y, least)
@@ -342,7 +345,7 @@ def _better_warp(metamodel: Metamodel, u: Points, y: Vector, critical: CriticalI
     if not isinstance(metamodel, GaussianProcess):
         return None
     warp = better_warp(metamodel, u, y, critical)
-    other = warp or Warp.around_edge(y, critical, quantile=_QUANTILE)
+    other = warp or Warp.around_edge(y, critical, quantile=QUANTILE)
     return better_without_gap(metamodel, *without_repetitions(u, y), critical, other) or warp
 
 
