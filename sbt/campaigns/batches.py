@@ -11,7 +11,7 @@ from sbt.campaigns.unviolated import Unviolated
 from sbt.campaigns.wording import plural
 from sbt.estimators.intervals import FEW_HITS, CombinedEstimate, CountedBatch, combine_estimates
 
-__all__ = ["Told", "told_by_batches"]
+__all__ = ["Told", "clipped", "told_by_batches"]
 
 _CONFIDENCE = 0.95
 
@@ -63,7 +63,7 @@ def told_by_batches(
     few_low, few_high = min(hits, not_hits) < FEW_HITS, min(perhaps, misses) < FEW_HITS
     drawn, draws, tail = seen.limits, f"{plural(seen.draws, 'draw')} from {drawn_from}", 0.5 * (1.0 + _CONFIDENCE)
     limits = Limits(lambda c: low.limit(c, side=-1, few=few_low), lambda c: high.limit(c, side=1, few=few_high))
-    value, exact, warnings = _clipped(low.value), None, []
+    value, exact, warnings = clipped(low.value), None, []
     if hits and misses:
         limits = held(limits, seen, low.value, high.value, unstated=unstated)
     if not seen.critical:
@@ -93,7 +93,7 @@ def told_by_batches(
     if late:
         limits = limits.reaching(drawn.upper)
         warnings.append(denied_late(draws))
-    highest = max(_clipped(high.value), value)
+    highest = max(clipped(high.value), value)
     if not late and (few_low or few_high or hardly_known(value, low.std_error) or hardly_known(highest, high.std_error)):
         limits = limits.within(drawn, value, highest)
         warnings += denied_by_draws(drawn, draws, value, highest, tail)
@@ -104,5 +104,6 @@ def told_by_batches(
     return Told(value, highest, limits, low, high, hits, perhaps, exact, tuple(warnings))
 
 
-def _clipped(value: float) -> float:
+def clipped(value: float) -> float:
+    """Return an estimate of a probability within [0, 1]."""
     return min(max(value, 0.0), 1.0)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-from sbt.campaigns.batches import told_by_batches
+from sbt.campaigns.batches import clipped, told_by_batches
 from sbt.campaigns.clustering import Spread
 from sbt.campaigns.counting import DRAWN, NOMINAL, RANDOM, Seen, counted_batches, counted_iterations, nothing_critical
 from sbt.campaigns.crude import MonteCarloStage, SubsetStage, nominal_proportion, took_monte_carlo
@@ -258,7 +258,7 @@ def _convergence(log: Log, safe: list[CountedBatch], critical: list[CountedBatch
     for k in range(2, len(safe) + 1):
         low, high = combine_estimates(safe[:k]), combine_estimates(critical[:k])
         runs = int((log.history.iteration <= counted[k - 1]).sum())
-        steps.append(EstimateStep(runs, _clipped(low.value), low.limit(tail, side=-1), high.limit(tail, side=1)))
+        steps.append(EstimateStep(runs, clipped(low.value), low.limit(tail, side=-1), high.limit(tail, side=1)))
     return tuple(steps)
 
 
@@ -309,12 +309,12 @@ def conclude_sum(log: Log, settings: Settings) -> Concluded:
     if not took_sum(log):
         return _from_draws(log, settings)
     found = summed(log, settings)
-    value, limits = _clipped(found.share.value), Limits(found.lower, found.upper)
+    value, limits = clipped(found.share.value), Limits(found.lower, found.upper)
     bound = limits.upper(_CONFIDENCE) if found.hits == 0 and found.noisy else None
     return _conclusion(
         log, value, limits, failed=int(found.worst.critical.sum()) - found.hits,
         cov=found.std_error / value if value > 0 else None, hits=found.hits, failed_as_safe=value,
-        failed_as_critical=_clipped(found.worst.value), effective_sample_size=float(len(found.share.weight)),
+        failed_as_critical=clipped(found.worst.value), effective_sample_size=float(len(found.share.weight)),
         undetected_mass_bound=found.missing, counted=len(found.share.weight), combinations=found.combinations, exact_bound=bound,
         drawn_combinations=found.drawn or None,
     ), limits  # fmt: skip
@@ -324,10 +324,6 @@ def _from_repeats(log: Log, settings: Settings) -> Concluded:
     """Return what the repeats of subset simulation say."""
     value, limits, rest = told_by_repeats(log, settings, _CONFIDENCE)
     return _conclusion(log, value, limits, failed=int((~log.history.ok).sum()), **rest), limits
-
-
-def _clipped(value: float) -> float:
-    return min(max(value, 0.0), 1.0)
 
 
 ESTIMATION = CampaignKind(

@@ -373,9 +373,10 @@ class SequentialStage:
         if log_probability is None or not since.any():
             return None
         p = np.exp(log_probability(known.z[since])[0])
-        denied = np.where(known.critical[since], p, 1.0 - p) < _SURPRISE
-        off = before.off(known.u[since], known.y[since], stream(self.settings.seed, "deny", iteration)) > _OFF
-        return None if (denied | off).any() else log_probability
+        if (np.where(known.critical[since], p, 1.0 - p) < _SURPRISE).any():
+            return None
+        off = before.off(known.u[since], known.y[since], stream(self.settings.seed, "deny", iteration))
+        return None if (off > _OFF).any() else log_probability
 
 
 def _gain(pi: Vector) -> float:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from sbt.errors import InputError, did_you_mean
+from sbt.estimators.surrogate import QUANTILE
 from sbt.estimators.transfer import Transfer, Trend
 from sbt.loop.earlier import EarlierRuns
 from sbt.metamodels.base import Metamodel, fitted, named_errors, predicted
@@ -30,8 +31,6 @@ _POOLED, _POOLED_NEAREST = 500, 350
 """Old runs that a metamodel learns from beside those of its campaign, and how many of them are nearest to the critical edge."""
 _INTEGRATED = 16
 """Points over which an input is integrated that only the old campaign has."""
-_QUANTILE = 0.5
-"""Of the distances to the critical edge: the scale of the warp, as in estimations."""
 
 
 def transfer_of(
@@ -160,7 +159,7 @@ def _trend(
     if len(y) < 2:
         raise InputError(f"warm_start.transfer needs at least two runs with {part.metric}, but got {len(y)}")
     y = opened(_inputs(old, runs.x), y, part.critical, rng)
-    warp = Warp.around_edge(y, part.critical, quantile=_QUANTILE)
+    warp = Warp.around_edge(y, part.critical, quantile=QUANTILE)
     t = warp.values(y)
     if len(t) > _ROWS:
         order = np.argsort(np.abs(t), kind="stable")

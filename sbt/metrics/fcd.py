@@ -28,7 +28,7 @@ from scipy.spatial import cKDTree
 
 from sbt.errors import InputError
 from sbt.metrics import heights
-from sbt.metrics.geometry import STEPPED, farthest
+from sbt.metrics.geometry import FASTER, STEPPED, farthest
 from sbt.metrics.pairwise import without_overtaking
 from sbt.plugins import load, names
 from sbt.problem.arrays import Mask, Vector
@@ -39,7 +39,6 @@ __all__ = ["PERSON_SIZE", "Recording", "catalogue", "encounters", "near_pairs", 
 
 PERSON_SIZE = (0.215, 0.478)
 """Length and width of a person whose size is not in the file (m): SUMO's default pedestrian."""
-_FASTER = 1.3  # than its speed a walker moves at most
 _ABLE, _INEXACT, _RARE, _FEW = 10.0, 1.0, 0.01, 2
 """Who is farther ahead than by such accelerations (m/s^2), and this far (m), was teleported: in this share of steps, or few."""
 _COLUMNS = ("time", "x", "y", "angle", "speed", "acceleration", "length", "width", "z", "slope")
@@ -224,7 +223,7 @@ def _goes_on(
     end = np.clip(speed[1:], begin - change, begin + change)
     peak = 0.5 * (begin + end + change)  # who accelerates as long as it can, and brakes then, is farthest
     of = user[:-1]
-    walked = np.hypot(dx, dy) <= _FASTER * np.maximum(speed[1:], speed[:-1]) * elapsed + STEPPED
+    walked = np.hypot(dx, dy) <= FASTER * np.maximum(speed[1:], speed[:-1]) * elapsed + STEPPED
     reached = ahead <= (2.0 * peak**2 - begin**2 - end**2) / (2.0 * _ABLE) + _INEXACT
     explained = driven & np.where(person[of], walked, reached)
     steps, teleports = (np.bincount(of[rows], minlength=user[-1] + 1) for rows in (driven, driven & ~explained))

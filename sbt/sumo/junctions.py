@@ -8,12 +8,12 @@ from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
-from sbt.metrics.geometry import STEPPED
+from sbt.metrics.geometry import FASTER, STEPPED
 
 __all__ = ["Junctions", "told_of_junctions", "why_jumped"]
 
-_FASTER, _FURTHER = 1.3, 1.0
-"""How far nobody gets without a jump: this times its speed, as outer lanes of a bend are longer, and so far (m) beside that."""
+_FURTHER = 1.0
+"""How far (m) nobody gets without a jump, beside what its speed explains."""
 _PAVEMENT = {"pedestrian", "wheelchair"}
 _WALKING_AREA = re.compile(r":.*_w\d+")
 _REMEDY = "make it, and run SUMO, without no-internal-links"
@@ -70,9 +70,10 @@ class Junctions:
 
     def explain(self, name: str, moved: float, driven: float, *, walks: bool = False) -> bool:
         """Return whether a junction explains that one was moved so far (m), further than it can have driven (m)."""
-        most = _FASTER * driven + _FURTHER
-        if walks and moved > most:
-            return self.lack_walking_areas or moved > most - _FURTHER + STEPPED
+        if walks:
+            beside = _FURTHER if self.lack_walking_areas else STEPPED
+            return moved > FASTER * driven + beside
+        most = FASTER * driven + _FURTHER
         if moved <= most or not self.lack_lanes:
             return False
         return 0.0 <= self._sumo.vehicle.getLanePosition(name) <= most  # has just entered its edge
